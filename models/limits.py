@@ -38,7 +38,7 @@ LIMITS = {
     "text_letters": Limit(1_000, "characters of an id, a label or a name"),
     "polygon_points": Limit(10_000, "points of a polygon"),
     "json_bytes": Limit(2**28, "bytes of a JSON or XML file"),
-    "json_values": Limit(2**23, "commas, colons and brackets in the JSON of a GLB file"),
+    "json_values": Limit(2**23, "commas, colons and brackets of a JSON text"),
     "glb_bytes": Limit(2**28, "bytes of a GLB file"),
     "glb_nodes": Limit(200_000, "nodes of a GLB file"),
     "glb_placements": Limit(100_000, "mesh primitives of a GLB file, counted once per node that places them"),

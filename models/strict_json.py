@@ -8,25 +8,28 @@ from typing import Any
 from models.limits import require_within
 
 
-def parse_json(content: bytes | str) -> Any:
+def parse_json(content: bytes, allow_nan: bool = False) -> Any:
     """Parse a JSON text.
 
     Args:
-        content: Text, or UTF-8 bytes.
+        content: UTF-8 bytes.
+        allow_nan: Whether to accept NaN, Infinity and numbers beyond the range of 64 bits, so that the caller can name
+            their row.
 
     Returns:
         Parsed value.
 
     Raises:
-        ValueError: The text is not JSON, contains NaN, Infinity or a repeated key, is nested too deeply, or exceeds the
-            limit json_bytes.
+        LimitError: The text exceeds the limit json_bytes or json_values.
+        ValueError: The text is not JSON, contains a repeated key or, unless `allow_nan`, NaN or Infinity, or is nested
+            too deeply.
     """
     require_within("json_bytes", len(content))
+    # Each value of a JSON text needs up to a hundred times more memory than its text.
+    require_within("json_values", sum(map(content.count, (b",", b"[", b"{", b":"))))
+    strict: dict[str, Any] = {} if allow_nan else {"parse_constant": _refuse_constant, "parse_float": _parse_float}
     try:
-        text = content if isinstance(content, str) else content.decode("utf-8-sig")
-        return json.loads(
-            text, parse_constant=_refuse_constant, parse_float=_parse_float, object_pairs_hook=_make_object
-        )
+        return json.loads(content.decode("utf-8-sig"), object_pairs_hook=_make_object, **strict)
     except RecursionError as error:
         raise ValueError("the values are nested too deeply") from error
 

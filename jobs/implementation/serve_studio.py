@@ -8,6 +8,7 @@ import signal
 import socket
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
@@ -157,7 +158,7 @@ def open_port(host: str, port: int) -> socket.socket:
     return listener
 
 
-def wait_until(condition, seconds: float) -> None:
+def wait_until(condition: Callable[[], bool], seconds: float) -> None:
     """Wait until a condition holds, at most a number of seconds."""
     end = time.monotonic() + seconds
     while not condition() and time.monotonic() < end:

@@ -8,8 +8,8 @@ from itertools import product
 import pyarrow as pa
 from rich.progress import Progress
 
-from jobs.implementation.evaluate_scenes import count_scenes, prepare_lite0
 from jobs.support.cli import require_positive, resolve_path
+from jobs.support.lite0 import prepare_lite0
 from jobs.support.model_directories import find_pipeline_directory, read_label_kind
 from jobs.support.ray_session import start_ray
 from jobs.support.terminal import print_table
@@ -19,7 +19,7 @@ from models.pipeline import check_noise_scaling
 from models.sampling.diffusion import Diffusion
 from models.sampling.schedulers import SAMPLERS
 from pipelines.evaluation.evaluate import compare_datasets
-from pipelines.evaluation.features import FeatureConfig, compute_scene_features
+from pipelines.evaluation.features import FeatureConfig, compute_scene_features, count_scenes
 from pipelines.evaluation.sampler_sweep import (
     CHARTED,
     build_sampler_table,

@@ -92,6 +92,16 @@ class ImageFile:
 SceneSet = SceneSubset | ImageFile  # One side of a comparison.
 
 
+def count_scenes(side: SceneSet) -> int:
+    """Return the number of scenes of a side; 0 if a subset is empty."""
+    if isinstance(side, ImageFile):
+        return side.limit
+    try:
+        return sum(len(rows) for _, rows in side.shards())
+    except ValueError:
+        return 0
+
+
 def compute_features(pictures: np.ndarray, looks: FeatureConfig) -> dict[str, np.ndarray]:
     """Compute the features of pictures (n, H, W, 3) uint8 that the options name; each is an array (n, width)."""
     named = {"random": inception.compute_random_features(pictures)} if looks.random else {}

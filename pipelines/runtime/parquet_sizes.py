@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 MAX_FOOTER_BYTES = 2**24
+ITEM_BYTES = 8  # Upper bound of the size of a number and of an index into a dictionary.
 MAX_DEPTH = 16  # Structures of the format are nested at most about 8 deep.
 SHORT_BYTES, LONG_BYTES = 2**10, 2**20  # Bytes to read for a page header.
 DATA_PAGES, DICTIONARY_PAGE = (0, 3), 2

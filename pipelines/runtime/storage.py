@@ -16,12 +16,11 @@ import pyarrow.parquet as pq
 
 from models.limits import LimitError, find_limit, require_within
 from models.strict_json import parse_json
-from pipelines.runtime.parquet_sizes import measure_columns
+from pipelines.runtime.parquet_sizes import ITEM_BYTES, measure_columns
 
 pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
 
 TEMPORARY = ".tmp-"
-ITEM_BYTES = 8  # Upper bound of the size of a number and of an index into a dictionary.
 TEXT_BYTES = 2**28  # Texts of a column that surely have fewer bytes are decoded directly.
 
 
@@ -127,17 +126,17 @@ def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema |
     try:
         with fs.open_input_file(path) as stream:
             table = _read_checked(stream, columns, schema)
+    except (LimitError, SchemaError) as error:
+        raise ValueError(f"{uri}: {error}") from error
     except Exception as error:  # A damaged file makes pyarrow raise errors of many types.
-        if isinstance(error, RefusedError):
-            raise ValueError(f"{uri}: {error}") from error
         raise ValueError(
             f"{uri}: cannot be read as Parquet ({error}); delete the file and run the job that wrote it again"
         ) from error
     return table
 
 
-class RefusedError(ValueError):
-    """Raised if a readable file has another schema or exceeds a limit."""
+class SchemaError(ValueError):
+    """Raised if a readable file has another schema."""
 
 
 def _read_checked(stream: Any, columns: list[str] | None, schema: pa.Schema | None) -> pa.Table:
@@ -149,17 +148,14 @@ def _read_checked(stream: Any, columns: list[str] | None, schema: pa.Schema | No
         kind = found.field(name).type if len(found.get_all_field_indices(name)) == 1 else None
         if kind is None or (schema is not None and kind != schema.field(name).type):
             expected = "" if schema is None else f" or not of type {schema.field(name).type}"
-            raise RefusedError(f"column {name!r} is missing{expected}; another version wrote the file")
-    try:
-        num_rows, texts = _check_sizes(stream, found, wanted)
-        options: Any = {"read_dictionary": texts, "page_checksum_verification": True}
-        with pq.ParquetFile(stream, metadata=metadata, **options) as file:
-            table = file.read(columns=wanted).select(wanted)
-        if len(table) != num_rows:
-            raise pa.ArrowInvalid(f"{len(table)} rows can be read, but the file states {num_rows}")
-        return _decode_texts(table)
-    except LimitError as error:
-        raise RefusedError(str(error)) from error
+            raise SchemaError(f"column {name!r} is missing{expected}; another version wrote the file")
+    num_rows, texts = _check_sizes(stream, found, wanted)
+    options: Any = {"read_dictionary": texts, "page_checksum_verification": True}
+    with pq.ParquetFile(stream, metadata=metadata, **options) as file:
+        table = file.read(columns=wanted).select(wanted)
+    if len(table) != num_rows:
+        raise pa.ArrowInvalid(f"{len(table)} rows can be read, but the file states {num_rows}")
+    return _decode_texts(table)
 
 
 def _check_sizes(stream: Any, schema: pa.Schema, columns: Sequence[str]) -> tuple[int, list[str]]:

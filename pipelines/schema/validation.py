@@ -144,6 +144,10 @@ def _make_number_rule(low: float, high: float, expected: str, is_optional: bool 
     return lambda table, name: _require_numbers(table, name, low, high, expected, is_optional)
 
 
+def _make_choice_rule(choices: Sequence[str], is_optional: bool = False) -> Callable:
+    return lambda table, name: _require_choice(table, name, choices, is_optional)
+
+
 _FINITE = _make_number_rule(-np.inf, np.inf, "a finite number")
 _COUNT = _make_number_rule(0, np.inf, "a number of at least 0")
 _AREA = _make_number_rule(0, np.inf, "a finite number of at least 0, or null", is_optional=True)
@@ -152,7 +156,6 @@ _SIZE = _make_number_rule(float(np.finfo(np.float32).tiny), FAR_M, f"a positive 
 _ANGLE = _make_number_rule(-3.1416, 3.1416, "an angle in [-pi, pi]")
 _HEADING = _make_number_rule(-3.1416, 3.1416, "an angle in [-pi, pi], or null", is_optional=True)
 _POSITIVE = _make_number_rule(float(np.finfo(np.float64).tiny), FAR_M, "a positive number")
-_LABEL = lambda table, name: _require_choice(table, name, DENSITIES, is_optional=True)  # noqa: E731
 
 # For each table, the rule of each column.
 RULES: Mapping[str, Mapping[str, Callable[[pa.Table, str], None]]] = {
@@ -162,16 +165,16 @@ RULES: Mapping[str, Mapping[str, Callable[[pa.Table, str], None]]] = {
         "frame": _require_present,
         **dict.fromkeys(("x_m", "y_m", "z_m", "yaw_rad"), _FINITE),
         "world_from_imu": _validate_poses,
-        **dict.fromkeys(("vegetation_density", "vehicle_density"), _LABEL),
+        **dict.fromkeys(("vegetation_density", "vehicle_density"), _make_choice_rule(DENSITIES, is_optional=True)),
         **dict.fromkeys(("vegetation_volume_m3", "vehicle_volume_m3"), _COUNT),
         **dict.fromkeys(("num_primitives", *(f"num_{name}" for name in CATEGORIES), "primitive_offset"), _COUNT),
         **dict.fromkeys([f"{name}_area_m2" for name in GROUND_CLASSES], _AREA),
     },
     "primitives": {
         "scene_id": _require_present,
-        "category": lambda table, name: _require_choice(table, name, CATEGORIES),
+        "category": _make_choice_rule(CATEGORIES),
         "label": _require_texts,
-        "kind": lambda table, name: _require_choice(table, name, KINDS),
+        "kind": _make_choice_rule(KINDS),
         "instance_id": _require_present,
         **dict.fromkeys(("x_m", "y_m", "z_m"), _NEAR),
         **dict.fromkeys(("length_m", "width_m", "height_m"), _SIZE),

@@ -14,7 +14,7 @@ import ray.exceptions
 from pydantic import BaseModel
 
 from pipelines.studio.limits import StudioLimits
-from pipelines.studio.session import Answer, Studio, make_json_answer
+from pipelines.studio.studio import Answer, Studio, make_json_answer
 
 THREADS = 16  # Number of requests that the actor works on at the same time.
 MAX_PENDING = 256  # Maximum number of requests that the actor has not answered; further requests are refused.

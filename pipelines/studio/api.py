@@ -20,7 +20,7 @@ from pipelines.studio.requests import (
     ListRequest,
     OpenRequest,
 )
-from pipelines.studio.session import DOWNLOADS, Answer, make_json_answer
+from pipelines.studio.studio import DOWNLOADS, Answer, make_json_answer
 
 PAGE_FILES = {
     "/": ("studio.html", "text/html"),

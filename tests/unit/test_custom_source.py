@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from models.limits import LimitError
 from models.scene import CATEGORIES, CATEGORY_INDEX, GROUND_CLASSES, Grid
-from pipelines.preprocess.sources import custom
+from pipelines.preprocess.sources import custom, custom_tables
 from pipelines.preprocess.sources.custom import list_drives, read_drive, read_ground_classes, read_poses, read_splits
 from pipelines.preprocess.sources.drive import STATIC, Drive, Pose
 from pipelines.preprocess.sources.town.generator import generate_town
@@ -122,7 +122,7 @@ def test_custom_source_reads_pandas_frame_with_gaps_and_index(tmp_path):
     frame = pandas.DataFrame([*rows[:2], {"category": "pole"}, *rows[2:]])
     frame[frame.x_m > 0].to_parquet(folder / "boxes.parquet")
     stored = pq.read_schema(folder / "boxes.parquet")
-    assert custom.PANDAS_INDEX in stored.names and stored.field("frame").type == pa.float64()
+    assert custom_tables.PANDAS_INDEX in stored.names and stored.field("frame").type == pa.float64()
     assert_same_drive(a, read_drive(tmp_path / "b", "street"))
 
 

@@ -424,7 +424,7 @@ def test_glb_reader_counts_before_it_allocates(monkeypatch):
     monkeypatch.setenv("PRITTI_MAX_GLB_NODES", "1000")
     monkeypatch.setenv("PRITTI_MAX_JSON_VALUES", "10000")
     refuse_glb(*make_amplified_tree(1, 1001), "1,001 nodes of a GLB file; at most 1,000")
-    refuse_glb(b"[" + b"[]," * 5000 + b"0]", b"", "the JSON chunk: 10,001 commas, .* at most 10,000")
+    refuse_glb(b"[" + b"[]," * 5000 + b"0]", b"", "the JSON chunk is invalid .10,001 commas, .* at most 10,000")
     monkeypatch.setenv("PRITTI_MAX_GLB_BYTES", "100")
     with pytest.raises(ValueError, match="bytes of a GLB file; at most 100"):
         import_glb(join_glb(*make_points_tree()))

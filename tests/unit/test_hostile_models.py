@@ -114,7 +114,7 @@ CONFIGS = [
 def test_invalid_entry_is_named_without_taking_memory(file, changes, message, directory):
     """The refused configs ask for up to 20 GB. The test process may grow by 0.4 GB."""
     before = measure_peak_gb()
-    if isinstance(changes.get("width"), int) and changes["width"] > 2**64:  # Python does not write so many digits.
+    if isinstance(changes.get("width"), int) and changes["width"] > 2**64:  # json.dumps refuses to write such a number.
         text = json.dumps(json.loads((directory / file).read_text()) | {"width": "@"}).replace('"@"', "9" * 4001)
         (directory / file).write_text(text)
     else:
@@ -298,7 +298,7 @@ def test_repeated_key_is_found_in_linear_time():
     text = "{" + ",".join(f'"{k}":0' for k in range(100_000)) + ',"99999":1}'
     start = time.perf_counter()
     with pytest.raises(ValueError, match="'99999' occurs twice"):
-        parse_json(text)
+        parse_json(text.encode())
     assert time.perf_counter() - start < 2
 
 

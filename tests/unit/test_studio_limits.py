@@ -1,5 +1,6 @@
 """Tests of the studio without Ray: access control, malformed requests, budgets, the task queue and bounded sessions."""
 
+import asyncio
 import threading
 import time
 from dataclasses import replace
@@ -14,13 +15,23 @@ from pipelines.schema.tables import Shard, make_scene_tables
 from pipelines.studio.access import COOKIE, COOKIE_AGE_S, Gate
 from pipelines.studio.api import build_studio_app
 from pipelines.studio.limits import StudioError, StudioLimits
-from pipelines.studio.session import LocalBackend, Studio
 from pipelines.studio.sessions import Session, SessionStore
+from pipelines.studio.studio import Answer, Studio
 from pipelines.studio.tasks import BackgroundTask, Cancelled, TaskQueue
 
 POST = {"x-studio": "1", "content-type": "application/json"}
 TOKEN = "a-token-of-at-least-16-letters"
 ADDRESS = "http://studio.example"
+
+
+class LocalBackend:
+    """Answers requests in threads of this process instead of a Ray actor."""
+
+    def __init__(self, studio: Studio) -> None:
+        self.studio = studio
+
+    async def answer(self, operation: str, visitor: str, request=None) -> Answer:
+        return await asyncio.to_thread(self.studio.answer, operation, visitor, request)
 
 
 @pytest.fixture(scope="module")

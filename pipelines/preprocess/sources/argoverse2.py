@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from models.limits import require_within
 from models.scene import CATEGORY_INDEX
 from pipelines.preprocess.sources.drive import Drive, MapGround
-from pipelines.preprocess.sources.files import read_file, read_json_file
+from pipelines.preprocess.sources.files import are_all_numbers, read_file, read_json_file
 from pipelines.runtime.feather_sizes import measure_feather
 
 pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
@@ -342,16 +342,11 @@ def _read_points(path: Path, entry: dict, name: str, least: int, most: int | Non
         )
     require_within("polygon_points", len(points), f"{path}: {name} of {ascii(entry.get('id'))[:40]}")
     values = [point.get(axis) if isinstance(point, dict) else None for point in points for axis in "xy"]
-    if not _are_all_numbers(values, MAX_COORDINATE_M):
+    if not are_all_numbers(values, MAX_COORDINATE_M):
         raise ValueError(
             f"{path}: {name} of {ascii(entry.get('id'))[:40]} has a point without valid x, y; fix or drop it"
         )
     return np.array(values, np.float64).reshape(-1, 2)
-
-
-def _are_all_numbers(values: list, largest: float) -> bool:
-    """Return whether all JSON values are numbers in [-largest, largest]. NaN and true do not count as numbers."""
-    return all(type(value) in (int, float) and abs(value) <= largest for value in values)
 
 
 def _read_quad(edge1_m: np.ndarray, edge2_m: np.ndarray) -> np.ndarray:
@@ -396,7 +391,7 @@ def _read_sim2(path: Path) -> np.ndarray:
         isinstance(rotation, list) and len(rotation) == 4 and isinstance(translation, list) and len(translation) == 2
     ):
         raise ValueError(f"{path}: R must have 4 numbers and t must have 2; download the log again")
-    if scale is None or not _are_all_numbers([*rotation, *translation, scale], MAX_COORDINATE_M) or scale <= 0:
+    if scale is None or not are_all_numbers([*rotation, *translation, scale], MAX_COORDINATE_M) or scale <= 0:
         raise ValueError(f"{path}: R, t or s is no valid number; download the log again")
     matrix = np.array(rotation, np.float64).reshape(2, 2)
     if np.abs(matrix @ matrix.T - np.eye(2)).max() > 1e-3:

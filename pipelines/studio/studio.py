@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import logging
 from collections.abc import Callable
@@ -381,14 +380,3 @@ def draw_thumbnail(catalogue: Catalogue, index: int) -> str:
     except ValueError as error:
         logger.warning("studio: no thumbnail: %s", error)
         return ""
-
-
-class LocalBackend:
-    """Answers requests in threads of this process, for tests without Ray."""
-
-    def __init__(self, studio: Studio) -> None:
-        self.studio = studio
-
-    async def answer(self, operation: str, visitor: str, request: BaseModel | None = None) -> Answer:
-        """Carry out one request (`Studio.answer`)."""
-        return await asyncio.to_thread(self.studio.answer, operation, visitor, request)
