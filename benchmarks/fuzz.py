@@ -91,7 +91,7 @@ def raise_hang(*_: object) -> None:
     raise Hang
 
 
-def judge(form, number: int, seed: int, folder: Path, keep: Path | None) -> Run:
+def judge_run(form, number: int, seed: int, folder: Path, keep: Path | None) -> Run:
     """Carry out one run."""
     from fuzz_formats import Silent
 
@@ -127,7 +127,7 @@ def judge(form, number: int, seed: int, folder: Path, keep: Path | None) -> Run:
     return Run(number, verdict, reason)
 
 
-def work(name: str, first: int, stop: int, seed: int, keep: str, results: Connection) -> None:
+def run_child(name: str, first: int, stop: int, seed: int, keep: str, results: Connection) -> None:
     """Carry out runs in a child process; send the number of each run before and its result after it."""
     warnings.simplefilter("ignore")
     from fuzz_formats import FORMATS, make_town_drive
@@ -141,16 +141,16 @@ def work(name: str, first: int, stop: int, seed: int, keep: str, results: Connec
         assert form.read_bases(Path(temporary) / "valid")
         for number in range(first, stop):
             results.send(number)
-            results.send(judge(form, number, seed, Path(temporary) / "damaged", Path(keep) if keep else None))
+            results.send(judge_run(form, number, seed, Path(temporary) / "damaged", Path(keep) if keep else None))
     results.send(None)
 
 
-def watch(name: str, first: int, stop: int, config: Config, keep: str) -> Iterator[Run]:
+def watch_runs(name: str, first: int, stop: int, config: Config, keep: str) -> Iterator[Run]:
     """Yield the results of runs; a child process that ends or hangs is replaced."""
     context = multiprocessing.get_context("spawn")
     while first < stop:
         own, theirs = context.Pipe(duplex=False)
-        child = context.Process(target=work, args=(name, first, stop, config.seed, keep, theirs), daemon=True)
+        child = context.Process(target=run_child, args=(name, first, stop, config.seed, keep, theirs), daemon=True)
         child.start()
         theirs.close()
         is_started = False
@@ -176,10 +176,10 @@ def watch(name: str, first: int, stop: int, config: Config, keep: str) -> Iterat
                 break
 
 
-def fuzz(name: str, config: Config) -> list[Run]:
+def fuzz_format(name: str, config: Config) -> list[Run]:
     """Carry out all runs of a format in this process's children."""
     keep = config.keep if config.runs <= 10 else ""
-    return list(watch(name, config.first, config.first + config.runs, config, keep))
+    return list(watch_runs(name, config.first, config.first + config.runs, config, keep))
 
 
 def format_row(name: str, runs: list[Run]) -> str:
@@ -198,7 +198,7 @@ def main(config: Config) -> None:
 
     def run(name: str) -> None:
         start = time.monotonic()
-        runs = fuzz(name, config)
+        runs = fuzz_format(name, config)
         failed[name] = [one for one in runs if one.verdict not in VERDICTS[:2]]
         print(f"{format_row(name, runs)} {time.monotonic() - start:9.0f}", flush=True)
 
@@ -208,7 +208,7 @@ def main(config: Config) -> None:
         for one in runs[:20]:
             print(f"\n{name} run {one.number}: {one.verdict}\n{one.reason}")
             if config.keep and config.runs > 10:
-                fuzz(name, Config((name,), 1, one.number, config.seed, config.keep))
+                fuzz_format(name, Config((name,), 1, one.number, config.seed, config.keep))
     if any(failed.values()):
         raise SystemExit(1)
 

@@ -148,7 +148,9 @@ class Format(ABC):
             self.check(folder / str(number), self.read(folder / str(number)), files)
         return True
 
-    def pick(self, base: Files, rng: random.Random, change: Callable[[bytes, random.Random], bytes]) -> Files:
+    def change_one_file(
+        self, base: Files, rng: random.Random, change: Callable[[bytes, random.Random], bytes]
+    ) -> Files:
         """Apply a change to one file."""
         name = rng.choice(sorted(base))
         return base | {name: change(base[name], rng)}
@@ -179,7 +181,7 @@ class Tables(Format):
 
     def damage(self, base: Files, rng: random.Random) -> Files:
         if rng.random() < 0.5:
-            return self.pick(base, rng, change_bytes) | {BYTES: b""}
+            return self.change_one_file(base, rng, change_bytes) | {BYTES: b""}
         k = rng.randrange(3)
         table = self.tables[k]
         for _ in range(rng.choice([1, 1, 2])):
@@ -226,7 +228,7 @@ class OwnGlb(Format):
         self.bases = [{"a.glb": export_glb(make_scenes(drive)[0])}]
 
     def damage(self, base: Files, rng: random.Random) -> Files:
-        return self.pick(base, rng, change_glb)
+        return self.change_one_file(base, rng, change_glb)
 
     def read(self, folder: Path) -> Scene:
         return import_glb(str(folder / "a.glb"))
@@ -269,7 +271,7 @@ class ForeignGlb(Format):
         self.bases = [{"a.glb": plain}, {"a.glb": join_glb(json.dumps(inside).encode(), b"")}]
 
     def damage(self, base: Files, rng: random.Random) -> Files:
-        return self.pick(base, rng, change_glb)
+        return self.change_one_file(base, rng, change_glb)
 
     def read(self, folder: Path) -> Any:
         content = storage.read_bytes(str(folder / "a.glb"), "glb_bytes")
@@ -307,7 +309,7 @@ class Npz(Format):
     """Directories and contents of .npz files."""
 
     def damage(self, base: Files, rng: random.Random) -> Files:
-        return self.pick(base, rng, change_npz)
+        return self.change_one_file(base, rng, change_npz)
 
     def load(self, content: bytes, name: str) -> np.ndarray | None:
         """Return an array as numpy reads it, or None."""
@@ -395,7 +397,7 @@ class Kitti360(Format):
         ]
 
     def damage(self, base: Files, rng: random.Random) -> Files:
-        return self.pick(base, rng, change_text)
+        return self.change_one_file(base, rng, change_text)
 
     def read(self, folder: Path) -> Any:
         return kitti360.read_drive(folder, kitti360.list_sequences(folder)[0])
@@ -546,7 +548,7 @@ class Edits(Format):
 
     def damage(self, base: Files, rng: random.Random) -> Files:
         if rng.random() < 0.3:
-            return self.pick(base, rng, change_bytes)
+            return self.change_one_file(base, rng, change_bytes)
         return {"edits.json": dump_json(change_tree(json.loads(base["edits.json"]), rng, rng.choice([1, 2])), rng)}
 
     def read(self, folder: Path) -> Any:

@@ -70,9 +70,9 @@ def sweep_seams(config: Config) -> list[dict]:
             rows.append(make_seam_row(mode, request.repaint, seams, objects, estimate_seam_ratios(measured.records)))
             first = next(read_scenes(output, request.source))
             pictures.append(Picture(first.scene_id, draw_lines(first, SeamLines()), name))
+        objects = count_objects_per_ha(scene for shard, chosen in real.shards() for scene in shard.scenes(chosen))
         for key, name in enumerate(("real", "joined")):
             measured = measure_seams(real, SeamLines(config.real_rows_m), config.num_actors, is_joined=name == "joined")
-            objects = count_objects_per_ha(scene for shard, chosen in real.shards() for scene in shard.scenes(chosen))
             ratios = estimate_seam_ratios(measured.records, key)
             rows.append(make_seam_row(COLUMNS[name], None, int(measured.seams.sum()), objects, ratios))
     storage.write_json(rows, storage.join_uri(output, "sweep.json"))

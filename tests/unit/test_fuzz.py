@@ -29,7 +29,7 @@ def test_damaged_files_are_refused_or_read_correctly(kind, drive, tmp_path):
     before = signal.signal(signal.SIGALRM, fuzz.raise_hang)
     try:
         numbers = [*FOUND.get(form.name, []), *range(RUNS)]
-        runs = [fuzz.judge(form, number, 0, tmp_path / "damaged", None) for number in numbers]
+        runs = [fuzz.judge_run(form, number, 0, tmp_path / "damaged", None) for number in numbers]
     finally:
         signal.signal(signal.SIGALRM, before)
     failed = [run for run in runs if run.verdict not in ("refused", "accepted")]
@@ -45,7 +45,7 @@ def test_fuzzer_notices_silent_damage(drive, tmp_path, monkeypatch):
     monkeypatch.setattr("pipelines.schema.tables.validate_shard", lambda *_: None)
     before = signal.signal(signal.SIGALRM, fuzz.raise_hang)
     try:
-        verdicts = {fuzz.judge(form, number, 0, tmp_path / "damaged", None).verdict for number in range(100)}
+        verdicts = {fuzz.judge_run(form, number, 0, tmp_path / "damaged", None).verdict for number in range(100)}
     finally:
         signal.signal(signal.SIGALRM, before)
     assert "different" in verdicts and "exception" in verdicts
