@@ -45,7 +45,8 @@ class Record:
     times_s: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     statuses: Counter[tuple[str, int]] = field(default_factory=Counter)
     tasks: Counter[str] = field(default_factory=Counter)
-    memory_bytes: int = 0
+    memory_bytes: Counter[str] = field(default_factory=Counter)
+    """Memory of the processes of each name at the moment of the largest sum."""
 
 
 async def visit(number: int, config: Config, address: str, end: float, record: Record) -> None:
@@ -98,13 +99,14 @@ async def visit(number: int, config: Config, address: str, end: float, record: R
 async def watch_memory(process: psutil.Process, end: float, record: Record) -> None:
     """Record the largest memory of a process and its descendants; shared pages count once."""
     while time.monotonic() < end:
-        total = 0
+        now = Counter[str]()
         for one in [process, *process.children(recursive=True)]:
             try:
-                total += one.memory_full_info().pss
+                name = " ".join(Path(word).name for word in one.cmdline()[:2]) if one.cmdline() else one.name()
+                now[name] += one.memory_full_info().pss
             except psutil.Error:
                 continue
-        record.memory_bytes = max(record.memory_bytes, total)
+        record.memory_bytes = max(record.memory_bytes, now, key=Counter.total)
         await asyncio.sleep(5)
 
 
@@ -140,7 +142,9 @@ def main(config: Config) -> None:
         )
     errors = sum(n for (_, status), n in record.statuses.items() if status not in (200, 429))
     print(f"tasks: {dict(record.tasks)}; answers other than 200 and 429: {errors}")
-    print(f"memory of all processes of the studio: {record.memory_bytes / 2**30:.2f} GiB")
+    print(f"memory of all processes of the studio: {record.memory_bytes.total() / 2**30:.2f} GiB")
+    for name, size in record.memory_bytes.most_common(6):
+        print(f"  {size / 2**20:6,.0f} MiB  {name[:80]}")
 
 
 if __name__ == "__main__":

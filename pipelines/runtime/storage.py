@@ -107,13 +107,16 @@ def _list_dictionary_columns(table: pa.Table) -> list[str]:
     return [f.name for f in table.schema if pa.types.is_string(f.type)]
 
 
-def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema | None = None) -> pa.Table:
+def read_parquet(
+    uri: str, columns: list[str] | None = None, schema: pa.Schema | None = None, encoded: Sequence[str] = ()
+) -> pa.Table:
     """Read a Parquet file of any origin, and verify its page checksums if it has them.
 
     Args:
         uri: File.
         columns: Names of the columns to read (default: all columns).
         schema: Types that the columns must have (default: no check).
+        encoded: Names of text columns to return with dictionary encoding (default: plain texts).
 
     Returns:
         Table.
@@ -125,7 +128,7 @@ def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema |
     fs, path = resolve_uri(uri)
     try:
         with fs.open_input_file(path) as stream:
-            table = _read_checked(stream, columns, schema)
+            table = _read_checked(stream, columns, schema, encoded)
     except (LimitError, SchemaError) as error:
         raise ValueError(f"{uri}: {error}") from error
     except Exception as error:  # A damaged file makes pyarrow raise errors of many types.
@@ -139,7 +142,7 @@ class SchemaError(ValueError):
     """Raised if a readable file has another schema."""
 
 
-def _read_checked(stream: Any, columns: list[str] | None, schema: pa.Schema | None) -> pa.Table:
+def _read_checked(stream: Any, columns: list[str] | None, schema: pa.Schema | None, encoded: Sequence[str]) -> pa.Table:
     """Read columns from a stream after checks of types and sizes; the names of columns may not repeat."""
     metadata = pq.read_metadata(stream)
     found = metadata.schema.to_arrow_schema()
@@ -150,12 +153,12 @@ def _read_checked(stream: Any, columns: list[str] | None, schema: pa.Schema | No
             expected = "" if schema is None else f" or not of type {schema.field(name).type}"
             raise SchemaError(f"column {name!r} is missing{expected}; another version wrote the file")
     num_rows, texts = _check_sizes(stream, found, wanted)
-    options: Any = {"read_dictionary": texts, "page_checksum_verification": True}
+    options: Any = {"read_dictionary": [*texts, *encoded], "page_checksum_verification": True}
     with pq.ParquetFile(stream, metadata=metadata, **options) as file:
         table = file.read(columns=wanted).select(wanted)
     if len(table) != num_rows:
         raise pa.ArrowInvalid(f"{len(table)} rows can be read, but the file states {num_rows}")
-    return _decode_texts(table)
+    return _decode_texts(table, encoded)
 
 
 def _check_sizes(stream: Any, schema: pa.Schema, columns: Sequence[str]) -> tuple[int, list[str]]:
@@ -190,13 +193,13 @@ def _holds_texts(kind: pa.DataType) -> bool:
     return any(_is_text(part) or _holds_texts(part) for part in inner)
 
 
-def _decode_texts(table: pa.Table) -> pa.Table:
-    """Replace dictionaries by texts, after a check of their total length."""
-    if not any(pa.types.is_dictionary(kind) for kind in table.schema.types):
+def _decode_texts(table: pa.Table, encoded: Sequence[str]) -> pa.Table:
+    """Replace dictionaries by texts, except in the columns `encoded`, after a check of their total length."""
+    if not any(pa.types.is_dictionary(f.type) and f.name not in encoded for f in table.schema):
         return table
     total, fields = 0, []
     for field in table.schema:
-        if pa.types.is_dictionary(field.type):
+        if pa.types.is_dictionary(field.type) and field.name not in encoded:
             for chunk in table[field.name].chunks:
                 lengths = pc.take(pc.binary_length(chunk.dictionary), chunk.indices)
                 total += pc.sum(pc.cast(lengths, pa.int64())).as_py() or 0

@@ -16,14 +16,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from models.geometry.cholesky import compute_cholesky_parameters
-from models.scene import CATEGORIES, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
+from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
 from pipelines.runtime import storage
-from pipelines.schema.validation import validate_shard, validate_table
+from pipelines.schema.validation import encode_texts, validate_shard, validate_table
 
 TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
+TEXTS = ("scene_id", "category", "label", "kind")  # Text columns of the table `primitives`.
 SCHEMA_VERSION = "1"  # Version of the column names and types. Descriptions may change within a version.
 HEIGHT_STEP_M = 0.01
 MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # Largest height (m) that a 16-bit integer can store.
@@ -400,10 +400,16 @@ def parse_scenes(
     Yields:
         Scene of each row.
     """
+    start = 0
+    if rows is not None:
+        # The arrays of a Scene are views: only the requested rows may stay in memory.
+        scenes, rasters = scenes.take(rows), rasters.take(rows)
+        spans = zip(scenes["primitive_offset"].to_pylist(), scenes["num_primitives"].to_pylist(), strict=True)
+        primitives = pa.concat_tables([primitives.slice(0, 0), *(primitives.slice(*span) for span in spans)])
     fields = _read_primitive_fields(primitives)
-    rows = list(range(len(scenes)) if rows is None else rows)
-    for scene, raster in zip(scenes.take(rows).to_pylist(), rasters.take(rows).to_pylist(), strict=True):
-        here = slice(scene["primitive_offset"], scene["primitive_offset"] + scene["num_primitives"])
+    for scene, raster in zip(scenes.to_pylist(), rasters.to_pylist(), strict=True):
+        here = slice(start, start + scene["num_primitives"])
+        start = here.stop
         grid = Grid(raster["front_m"], raster["left_m"], raster["resolution_m"], raster["rows"], raster["cols"])
         classes = tuple(raster["ground_classes"])
         height, occupied = decode_ground(
@@ -441,10 +447,11 @@ def find_category_indices(names: pa.ChunkedArray) -> np.ndarray:
     Raises:
         ValueError: A name is not a category of this version.
     """
-    category = pc.index_in(names, pa.array(CATEGORIES))  # pyright: ignore[reportAttributeAccessIssue]
-    if category.null_count:
+    texts, index = encode_texts(names)
+    category = np.array([CATEGORY_INDEX.get(text, -1) for text in [*texts.to_pylist(), None]], np.int8)[index]
+    if (category < 0).any():
         raise ValueError("the primitives table holds an unknown category; preprocess again with this version")
-    return category.to_numpy().astype(np.int8)
+    return category
 
 
 def read_fixed_lists(column: pa.ChunkedArray, width: int) -> np.ndarray:
@@ -471,6 +478,7 @@ def _read_primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
     def stacked(*names: str) -> np.ndarray:
         return np.stack([column(name) for name in names], axis=1)
 
+    texts, index = encode_texts(primitives["label"])
     return {
         "category": find_category_indices(primitives["category"]),
         "center_m": stacked("x_m", "y_m", "z_m"),
@@ -479,7 +487,7 @@ def _read_primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
         "existence": column("existence"),
         "heading_rad": column("heading_rad").astype(np.float32),
         "instance_id": column("instance_id"),
-        "label": column("label").astype(object),
+        "label": np.array([*texts.to_pylist(), None], object)[index],
     }
 
 
@@ -516,12 +524,13 @@ class Shard:
         name = f"part-{self.number:05d}.parquet"
         return storage.join_uri(self.root, table, f"source={self.source}", f"split={self.split}", name)
 
-    def read(self, table: str, columns: list[str] | None = None) -> pa.Table:
+    def read(self, table: str, columns: list[str] | None = None, encoded: Sequence[str] = ()) -> pa.Table:
         """Read the shard's rows of a table, and validate each column.
 
         Args:
             table: Name of the table, such as scenes.
             columns: Names of the columns to read (default: all).
+            encoded: Names of text columns to return with dictionary encoding, which is faster (default: plain texts).
 
         Returns:
             The rows.
@@ -537,7 +546,7 @@ class Shard:
             "edits": EDITS,
             "rejects": REJECTS,
         }.get(table)
-        content = storage.read_parquet(self.path(table), columns, schema)
+        content = storage.read_parquet(self.path(table), columns, schema, encoded)
         with self._naming(table):
             validate_table(table, content)
         return content
@@ -546,13 +555,13 @@ class Shard:
         """Read the tables scenes, primitives and rasters, and validate that they belong together.
 
         Returns:
-            The three tables.
+            The three tables. The texts of `primitives` have dictionary encoding.
 
         Raises:
             ValueError: A file is missing or damaged, or a value is invalid. The message names the file, the row and the
                 column.
         """
-        tables = self.read("scenes"), self.read("primitives"), self.read("rasters")
+        tables = self.read("scenes"), self.read("primitives", encoded=TEXTS), self.read("rasters")
         with self._naming("scenes"):
             validate_shard(*tables)
         return tables

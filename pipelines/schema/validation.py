@@ -57,19 +57,40 @@ def _require_numbers(
             _refuse(table, name, ~((values >= low) & (values <= high) & np.isfinite(values)), expected)
 
 
+def encode_texts(column: pa.ChunkedArray) -> tuple[pa.Array, np.ndarray]:
+    """Encode the texts of a column as indices.
+
+    Args:
+        column: (n,) texts, plain or with dictionary encoding.
+
+    Returns:
+        The different texts, and (n,) the index of the text of each row; -1 is null.
+    """
+    if not pa.types.is_dictionary(column.type):
+        column = column.dictionary_encode()
+    array: Any = column.combine_chunks()
+    index = array.indices
+    if index.null_count:
+        index = index.fill_null(-1)
+    return array.dictionary, index.to_numpy()
+
+
 def _require_texts(table: pa.Table, name: str) -> None:
     _require_present(table, name)
-    letters = pc.utf8_length(table[name]).to_numpy()
+    texts, index = encode_texts(table[name])
     limit = find_limit("text_letters")
-    if len(letters) and letters.max() > limit:
+    if (pc.max(pc.binary_length(texts)).as_py() or 0) <= limit:  # A letter has at least one byte.
+        return
+    letters = pc.utf8_length(texts).to_numpy()[index]
+    if letters.max() > limit:
         require_within("text_letters", int(letters.max()), f"row {int(letters.argmax())}, column {name!r}")
 
 
 def _require_choice(table: pa.Table, name: str, choices: Sequence[str], is_optional: bool = False) -> None:
-    values = table[name]
-    known = pc.is_in(values, pa.array([*choices, None] if is_optional else choices, pa.string()))
-    if not pc.all(known, min_count=0).as_py():
-        _refuse(table, name, ~known.to_numpy(), f"one of {', '.join(choices)}")
+    texts, index = encode_texts(table[name])
+    known = np.array([text in choices for text in texts.to_pylist()] + [is_optional])[index]
+    if not known.all():
+        _refuse(table, name, ~known, f"one of {', '.join(choices)}")
 
 
 def _read_lists(table: pa.Table, name: str, width: int) -> np.ndarray:
@@ -87,9 +108,10 @@ def _read_lists(table: pa.Table, name: str, width: int) -> np.ndarray:
 
 def _validate_scene_ids(table: pa.Table, name: str) -> None:
     _require_texts(table, name)
-    _refuse(table, name, pc.equal(table[name], "").to_numpy(), "an id")
-    if len(pc.unique(table[name])) != len(table):
-        names, seen = table[name].to_pylist(), set()
+    names, seen = table[name].to_pylist(), set()
+    if "" in names:
+        _refuse(table, name, np.array([n == "" for n in names]), "an id")
+    if len(set(names)) != len(names):
         _refuse(table, name, np.array([n in seen or seen.add(n) is not None for n in names]), "an id of only one row")
 
 
@@ -109,13 +131,14 @@ def _validate_poses(table: pa.Table, name: str) -> None:
 
 def _validate_rotations(table: pa.Table, name: str) -> None:
     entry = np.ascontiguousarray(_read_lists(table, name, 9).T)  # Long rows are several times faster than 3 x 3 blocks.
-    x, y, z = (entry[[k, k + 3, k + 6]] for k in range(3))
-    bad = np.zeros(len(table), bool)
+    x, y, z = (entry[[k, k + 3, k + 6]] for k in range(3))  # Columns of the matrices, (3, n) each.
+    worst = np.zeros(len(table), np.float32)
     with np.errstate(invalid="ignore", over="ignore"):
-        for a, b, wanted in ((x, x, 1), (y, y, 1), (z, z, 1), (x, y, 0), (x, z, 0), (y, z, 0)):
-            bad |= ~(np.abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] - wanted) <= ORTHONORMAL)
-        across = [x[k - 2] * y[k - 1] - x[k - 1] * y[k - 2] for k in range(3)]
-        bad |= ~(across[0] * z[0] + across[1] * z[1] + across[2] * z[2] > 0)
+        for a, b, wanted in ((x, x, 1), (y, y, 1), (x, y, 0)):
+            np.maximum(worst, np.abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] - wanted), out=worst)
+        for k in range(3):  # In a right-handed system, z is the cross product of x and y.
+            np.maximum(worst, np.abs(x[k - 2] * y[k - 1] - x[k - 1] * y[k - 2] - z[k]), out=worst)
+        bad = ~(worst <= ORTHONORMAL)
     _refuse(table, name, bad, "an orthonormal, right-handed matrix")
 
 
@@ -226,18 +249,25 @@ def _validate_rasters(table: pa.Table) -> None:
         require_within("raster_pixels", int(pixels.max()), f"row {int(pixels.argmax())}, columns 'rows' and 'cols'")
     bits = pc.binary_length(table["occupied"]).to_numpy()
     _refuse_length(table, "occupied", bits, -(-pixels // 8), "one bit for each class, row and column")
-    rest = (1 << (-pixels % 8)) - 1  # Bits after the last pixel.
-    occupied = np.empty(len(table), np.int64)
-    for row, blob in enumerate(table["occupied"]):
-        mask = np.frombuffer(blob.as_buffer(), np.uint8)
-        aligned = len(mask) // 8 * 8
-        occupied[row] = np.bitwise_count(mask[:aligned].view(np.uint64)).sum(dtype=np.int64)
-        if aligned < len(mask):
-            occupied[row] += np.bitwise_count(mask[aligned:]).sum()
-        if rest[row] and mask[-1] & rest[row]:
-            raise ValueError(f"row {row}, column 'occupied': the bits after the last pixel are set")
+    occupied, last = _count_bits(table["occupied"])
+    padding = (1 << (-pixels % 8)) - 1  # Bits after the last pixel.
+    _refuse(table, "occupied", last & padding != 0, "no set bits after the last pixel")
     heights = pc.binary_length(table["height"]).to_numpy()
     _refuse_length(table, "height", heights, 2 * occupied, "two bytes for each set bit of `occupied`")
+
+
+def _count_bits(column: pa.ChunkedArray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of set bits and the last byte of each row of a binary column without nulls or empty rows."""
+    counts, last = [np.zeros(0, np.int64)], [np.zeros(0, np.uint8)]
+    for chunk in (chunk for chunk in column.chunks if len(chunk)):
+        _, positions, values = chunk.buffers()
+        ends = np.frombuffer(positions, np.int32)[chunk.offset : chunk.offset + len(chunk) + 1]
+        content = np.frombuffer(values, np.uint8)[ends[0] : ends[-1]]
+        ends = ends - ends[0]
+        words, step = (content, 1) if (ends % 8).any() else (content.view(np.uint64), 8)
+        counts.append(np.add.reduceat(np.bitwise_count(words), ends[:-1] // step, dtype=np.int64))
+        last.append(content[ends[1:] - 1])
+    return np.concatenate(counts), np.concatenate(last)
 
 
 def _refuse_length(table: pa.Table, name: str, got: np.ndarray, wanted: np.ndarray, meaning: str) -> None:
@@ -278,23 +308,26 @@ def validate_shard(scenes: pa.Table, primitives: pa.Table, rasters: pa.Table | N
         raise ValueError(f"primitives has {len(primitives)} rows, but the scenes of the shard have {total} primitives")
     owner = np.repeat(np.arange(len(scenes)), counts)
     if "scene_id" in primitives.column_names:
-        same = pc.equal(primitives["scene_id"], scenes["scene_id"].take(pa.array(owner)))
-        if not pc.all(same, min_count=0).as_py():
-            row = int(np.argmin(same.to_numpy()))
+        texts, index = encode_texts(primitives["scene_id"])
+        place = {text: row for row, text in enumerate(scenes["scene_id"].to_pylist())}
+        same = np.array([place.get(text, -1) for text in [*texts.to_pylist(), None]])[index] == owner
+        if not same.all():
+            row = int(np.argmin(same))
             raise ValueError(
                 f"primitives, row {row}, column 'scene_id': {primitives['scene_id'][row].as_py()!r}, but this row"
                 f" belongs to scene {scenes['scene_id'][int(owner[row])].as_py()!r}"
             )
-    named = [name for name in CATEGORIES if f"num_{name}" in scenes.column_names]
+    columns = set(scenes.column_names)
+    named = [name for name in CATEGORIES if f"num_{name}" in columns]
     if named and "category" in primitives.column_names:
-        category = pc.index_in(primitives["category"], pa.array(CATEGORIES)).to_numpy()
+        texts, index = encode_texts(primitives["category"])
+        category = np.array([CATEGORY_INDEX[text] for text in texts.to_pylist()] + [0])[index]
         found = np.bincount(owner * len(CATEGORIES) + category, minlength=len(scenes) * len(CATEGORIES))
-        for name in named:
-            stated = scenes[f"num_{name}"].to_numpy()
-            counted = found.reshape(-1, len(CATEGORIES))[:, CATEGORY_INDEX[name]]
-            if (bad := stated != counted).any():
-                row = int(np.argmax(bad))
-                raise ValueError(
-                    f"scenes, row {row}, column 'num_{name}': {stated[row]}, but the primitives table holds"
-                    f" {counted[row]} of this category"
-                )
+        found = found.reshape(-1, len(CATEGORIES))[:, [CATEGORY_INDEX[name] for name in named]]
+        stated = np.stack([scenes[f"num_{name}"].to_numpy() for name in named], axis=1)
+        if (bad := stated != found).any():
+            row, k = (int(at[0]) for at in np.nonzero(bad))
+            raise ValueError(
+                f"scenes, row {row}, column 'num_{named[k]}': {stated[row, k]}, but the primitives table holds"
+                f" {found[row, k]} of this category"
+            )

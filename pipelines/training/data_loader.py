@@ -231,7 +231,8 @@ def _scale_steps(spec: LayoutSpec, step_m: float) -> np.ndarray:
 @lru_cache(maxsize=2 * WINDOW_SHARDS)
 def _read_stored_layouts(shard: Shard) -> StoredLayouts:
     scenes = shard.read("scenes", ["scene_id", "primitive_offset", "num_primitives"])
-    primitives = shard.read("primitives", ["scene_id", "category", "x_m", "y_m", "z_m", "cholesky"]).combine_chunks()
+    columns = ["scene_id", "category", "x_m", "y_m", "z_m", "cholesky"]
+    primitives = shard.read("primitives", columns, encoded=("scene_id", "category")).combine_chunks()
     rasters = shard.read("rasters")
     try:
         validate_shard(scenes, primitives, rasters)

@@ -50,6 +50,18 @@ def test_shard_round_trips_scenes(tmp_path, scenes):
     assert not [p for p in tmp_path.rglob("*") if p.name.startswith(storage.TEMPORARY)]
 
 
+def test_one_scene_does_not_keep_shard_in_memory(tmp_path, scenes):
+    shard = Shard(str(tmp_path), "town", "train", 0)
+    shard.write(scenes)
+    scene = shard.scenes(rows=[0])[0]
+    for array in (scene.center_m, scene.size_m, scene.rotation, scene.label, scene.instance_id, scene.existence):
+        owner = array
+        while isinstance(owner.base, np.ndarray):
+            owner = owner.base
+        held = owner.nbytes if owner.base is None else owner.base.get_total_buffer_size()
+        assert held <= 2 * array.nbytes
+
+
 def test_shard_round_trips_empty_scenes(tmp_path):
     shard = Shard(str(tmp_path), "town", "test", 0)
     shard.write([random_scene(0, n=0, split="test")])
