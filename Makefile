@@ -3,10 +3,10 @@
 #   make demo        train, sample and report with the demo preset
 #   make lint        ruff (rules and format) and pyright
 #   make test-fast   tests/unit: no Ray, no browser, about a minute
-#   make test        all tests but slow ones, with line coverage
+#   make test        all tests but slow ones
 #   make test-slow   long checks, marked slow
 #   make docs        the documentation site in build/site; executes the tutorials
-#   make coverage    lines that the last make test did not run, without those in Ray's processes
+#   make coverage    make test with line coverage, without lines in Ray's processes; half as long again
 PYTHON ?= python3
 BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2
@@ -22,8 +22,8 @@ export OMP_WAIT_POLICY ?= PASSIVE
 # All processes of Ray import the same modules: without bytecode on disk each compiles them again.
 unexport PYTHONDONTWRITEBYTECODE
 
-TESTS := test test-fast test-slow
-.PHONY: demo lint docs $(TESTS) coverage browser clean
+TESTS := test test-fast test-slow coverage
+.PHONY: demo lint docs $(TESTS) browser clean
 demo: .venv/ready
 	$(BIN)/python jobs/run_demo.py --output runs/demo
 
@@ -45,15 +45,13 @@ test-fast: .venv/ready
 	$(PYTEST) tests/unit
 
 test: .venv/ready browser
-	$(PYTEST) -m "not slow" --cov --cov-report=
-	@echo "line coverage: $$($(BIN)/coverage report --format=total) % (make coverage lists the lines missed)"
+	$(PYTEST) -m "not slow"
 
 test-slow: .venv/ready
 	$(PYTEST) -m slow
 
-coverage: .venv/ready
-	@test -f .coverage || { echo "run make test first; it measures the coverage"; exit 1; }
-	$(BIN)/coverage report
+coverage: .venv/ready browser
+	$(PYTEST) -m "not slow" --cov --cov-report=term-missing:skip-covered
 
 # CI needs a browser, as skipped browser tests fail there, and nginx for a test of infra/nginx.conf. Elsewhere this does
 # nothing.

@@ -261,6 +261,7 @@ def run_and_kill_job(root: Path, log: Path, when: Callable[[], bool]) -> None:
             psutil.wait_procs(alive, timeout=5)
 
 
+@pytest.mark.slow  # test_preprocess_job.py resumes an interrupted run without killing a driver.
 def test_preprocess_resumes_after_driver_kills(town, tmp_path):
     root, log = tmp_path / "out", tmp_path / "log"
     staging = root / ".staging"
