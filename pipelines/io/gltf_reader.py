@@ -73,10 +73,17 @@ class MeshPart(NamedTuple):
 
 
 class Glb(NamedTuple):
-    """Content of a file: the extras of the default scene, and the mesh parts in the order of the node tree."""
+    """Content of a file.
+
+    Attributes:
+        extras: Extras of the default scene.
+        parts: Mesh parts in the order of the node tree.
+        bare: Index and extras of each placed node without a mesh.
+    """
 
     extras: dict
     parts: list[MeshPart]
+    bare: list[tuple[int, dict]]
 
 
 def read_glb(data: bytes) -> Glb:
@@ -223,6 +230,12 @@ def _list_names(tree: dict, key: str) -> set[str]:
 # ------------------------------------------------------------------------------------------------------------ scene
 
 
+def _get_extras(node: dict) -> dict:
+    """Return the extras of a node; glTF also allows values that are no objects."""
+    extras = node.get("extras")
+    return extras if type(extras) is dict else {}
+
+
 class _Reader:
     """Reads a parsed file. A mesh is read once, regardless of how many nodes place it."""
 
@@ -252,10 +265,11 @@ class _Reader:
     def read_scene(self) -> Glb:
         scene = _pick(self.lists["scenes"], self.default_scene, "the file", "scene")
         roots = _get(scene, "nodes", list, f"scene {self.default_scene}", [])
-        placed, placements, total = [], 0, 0
+        placed, bare, placements, total = [], [], 0, 0
         most_placements = find_limit("glb_placements")
         for index, node, file_from_mesh in self._list_placed_nodes(roots):
             if "mesh" not in node:
+                bare.append((index, _get_extras(node)))
                 continue
             mesh = node["mesh"]
             primitives = self._list_primitives(mesh, f"node {index}")
@@ -272,10 +286,9 @@ class _Reader:
             placed.append((index, node, mesh, file_from_mesh))
         parts = []
         for index, node, mesh, file_from_mesh in placed:
-            extras = node.get("extras")
-            extras = extras if type(extras) is dict else {}
+            extras = _get_extras(node)
             parts += [MeshPart(index, extras, file_from_mesh, local) for local in self._read_mesh(mesh)]
-        return Glb(_get(scene, "extras", dict, "the scene", {}), parts)
+        return Glb(_get(scene, "extras", dict, "the scene", {}), parts, bare)
 
     def _list_placed_nodes(self, roots: list) -> Iterator[tuple[int, dict, np.ndarray]]:
         """Yield the index of each node, the node and its transform file_from_node (4, 4). Parents come first."""

@@ -108,6 +108,11 @@ def import_glb(
 def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     about = _read_metadata(glb.extras)
     _check_parts(glb.parts, about["ground_classes"])
+    for node, extras in glb.bare:
+        if named := {"category", "classes"} & extras.keys():
+            raise ValueError(
+                f"node {node} has no mesh, but its extras name {min(named)!r}; delete the node or its extras"
+            )
     nodes = [part for part in glb.parts if "category" in part.extras]
     require_within("scene_primitives", len(nodes))
     letters = find_limit("text_letters")

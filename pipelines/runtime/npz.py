@@ -24,6 +24,7 @@ from pipelines.runtime.storage import resolve_uri
 SUFFIX = ".npy"
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # numpy writes no other compression.
 ENCRYPTED = 1  # Bit of the flags of a zip entry.
+ZIP_STARTS = (b"PK\3\4", b"PK\5\6")  # First bytes of an archive; the latter begin an empty one.
 PLAIN_KINDS = "iufU"  # Integers, floats and texts.
 HEADER_BYTES = 10_000  # Maximum length of the description of an array, as in numpy.
 DIRECTORY_BYTES = 2**20  # Maximum length of the zip directory, which Python reads into memory; it lists the arrays.
@@ -225,6 +226,9 @@ def open_npz(source: str | os.PathLike | bytes, name: str = "") -> Iterator[NpzA
     with file:
         guarded = _OpeningStream(file)
         with _name_errors(uri):
+            # `zipfile` skips bytes before the archive, which numpy refuses.
+            if (start := guarded.read(4)) not in ZIP_STARTS:
+                raise NpzError(f"{uri}: begins with {start!r} and is not an .npz archive; write the file again")
             archive = zipfile.ZipFile(guarded)
             guarded.is_open = True
         with archive:

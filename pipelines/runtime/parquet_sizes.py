@@ -17,6 +17,7 @@ ITEM_BYTES = 8  # Upper bound of the size of a number and of an index into a dic
 MAX_DEPTH = 16  # Structures of the format are nested at most about 8 deep.
 SHORT_BYTES, LONG_BYTES = 2**10, 2**20  # Bytes to read for a page header.
 DATA_PAGES, DICTIONARY_PAGE = (0, 3), 2
+PAGES, ENCODINGS = frozenset(range(4)), frozenset(range(10))  # Numbers of the types that exist.
 
 Struct = dict[int, Any]
 
@@ -146,6 +147,8 @@ def _measure(file: Any) -> tuple[int, list[ColumnSize]]:
             if 8 in chunk or 9 in chunk or 1 in chunk:
                 raise ValueError("a column is encrypted or lies in another file")
             column = chunk[3]
+            if not _is_known(column):
+                raise ValueError("a column names an encoding or a type of page that the format does not have")
             values, size, has_dictionary = _measure_pages(file, column, end)
             path = tuple(name.decode("utf-8") for name in column[3])
             known = sizes.setdefault(k, [path, 0, 0, False])
@@ -153,6 +156,13 @@ def _measure(file: Any) -> tuple[int, list[ColumnSize]]:
                 raise ValueError(f"the path of column {k} differs from the schema")
             sizes[k] = [path, known[1] + values, known[2] + size, known[3] or has_dictionary]
     return _require_count(footer[3]), [ColumnSize(*entry) for entry in sizes.values()]
+
+
+def _is_known(column: Struct) -> bool:
+    """Return whether the listed encodings and types of pages exist; some readers refuse unknown ones, some do not."""
+    pages = column.get(13, [])
+    encodings = {*column[2], *(page[2] for page in pages)}
+    return encodings <= ENCODINGS and {page[1] for page in pages} <= PAGES
 
 
 def _require_count(value: Any) -> int:
