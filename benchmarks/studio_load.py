@@ -3,9 +3,9 @@
     python benchmarks/studio_load.py --datasets DIR                     200 visitors, 5 minutes
 
 The benchmark starts jobs/serve_studio.py and runs on the same machine. After each answer, a visitor waits 2 to 6 s. 5 %
-of the requests generate a scene (20 steps); the visitor then asks for the progress once per second. Target on two
-cores: no status but 200 and 429, a median time of at most 100 ms for requests that do not generate, and at most 3 GB of
-memory for all processes of the studio, Ray included.
+of the operations generate a scene (20 steps); the visitor then asks for the progress once per second. Target on two
+cores: no status but 200 and 429, a median time of at most 100 ms for requests that do not generate, and at most 3 GiB
+of memory for all processes of the studio, Ray included.
 """
 
 from __future__ import annotations
@@ -27,17 +27,22 @@ import tyro
 from common import describe_machine
 
 ROOT = Path(__file__).parents[1]
-KINDS = {"open": 30, "edit": 45, "undo": 10, "scenes": 10, "generate": 5}  # Percent of the requests.
+KINDS = {"open": 30, "edit": 45, "undo": 10, "scenes": 10, "generate": 5}  # Percent of the operations.
 PAUSE_S = (2.0, 6.0)
 
 
 @dataclass(frozen=True)
 class Config:
     datasets: str
+    """Dataset directory whose scenes visitors open."""
     model: str = "town"
+    """Model of the studio."""
     visitors: int = 200
+    """Number of visitors."""
     seconds: float = 300.0
+    """Duration (s)."""
     seed: int = 0
+    """Random seed."""
 
 
 @dataclass

@@ -26,7 +26,7 @@ class Config:
     datasets: tuple[str, ...] = ()
     """Dataset directories from which visitors can open scenes (default: $PRITTI_HOME/generated, if it has scenes)."""
     host: str = "127.0.0.1"
-    """Address to listen on; every address but a loopback address requires a token."""
+    """Address to listen on; visitors need a token unless it is a loopback address and --public-url is not set."""
     port: int = 8600
     """Port to listen on."""
     host_names: tuple[str, ...] = ()
@@ -39,7 +39,7 @@ class Config:
     tls_key: str = ""
     """File with the private key of --tls-certificate, in PEM format (default: none)."""
     token_file: str = ""
-    """File with the token that visitors need, at least 16 letters (default: none for a loopback address, otherwise a
+    """File with the token that visitors need, at least 16 characters (default: none for a loopback address, otherwise a
     random token)."""
     num_threads: int | None = None
     """Number of CPU threads for the network (default: all cores but one)."""

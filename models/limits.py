@@ -1,4 +1,4 @@
-"""Limits on what files of others may ask for, in one place, so that a small file cannot use up the memory.
+"""Limits on the sizes that untrusted files can state, so that a small file cannot exhaust the memory.
 
 Readers call `require_within` before they allocate memory for a number that a file states. The environment variable
 PRITTI_MAX_<NAME> replaces a limit, for example PRITTI_MAX_RASTER_PIXELS=1000000000; workers of Ray on other nodes need
@@ -32,13 +32,13 @@ class Limit(NamedTuple):
 LIMITS = {
     "raster_pixels": Limit(2**26, "pixels of all ground classes of a scene"),
     "scene_primitives": Limit(200_000, "primitives of a scene"),
-    "scene_coverage": Limit(2**29, "pixels of the bounding boxes of the ground triangles of a scene"),
-    "table_rows": Limit(2_000_000, "rows of a table file"),
-    "table_bytes": Limit(2**29, "bytes of the columns that are read from a table file, after decompression"),
-    "text_letters": Limit(1_000, "characters of an id, a label or a name"),
+    "scene_coverage": Limit(2**29, "pixels visited to rasterise the ground polygons or triangles of a scene"),
+    "table_rows": Limit(2_000_000, "rows, objects or list entries of a file"),
+    "table_bytes": Limit(2**29, "estimated bytes in memory of the columns that are read from a table file"),
+    "text_characters": Limit(1_000, "characters of an id, a label or a name"),
     "polygon_points": Limit(10_000, "points of a polygon"),
     "json_bytes": Limit(2**28, "bytes of a JSON or XML file"),
-    "json_values": Limit(2**23, "commas, colons and brackets of a JSON text"),
+    "json_values": Limit(2**23, "commas, colons and opening brackets of a JSON text"),
     "glb_bytes": Limit(2**28, "bytes of a GLB file"),
     "glb_nodes": Limit(200_000, "nodes of a GLB file"),
     "glb_placements": Limit(100_000, "mesh primitives of a GLB file, counted once per node that places them"),
@@ -72,13 +72,14 @@ def find_limit(name: str) -> int:
     return int(text)
 
 
-def require_within(name: str, number: float, place: str = "") -> None:
+def require_within(name: str, number: float, place: str = "", is_partial: bool = False) -> None:
     """Raise an error if a number exceeds a limit.
 
     Args:
         name: Key of LIMITS.
         number: Number that a file states or that follows from it.
         place: File, row or scene, for the message.
+        is_partial: Whether the count stopped at `number`, so there may be more.
 
     Raises:
         LimitError: The number exceeds the limit. The message names the number, the limit and the environment variable
@@ -89,6 +90,7 @@ def require_within(name: str, number: float, place: str = "") -> None:
         number = min(number, 10**30) if isinstance(number, int) else number  # Longer integers are not readable.
         plain = f"{number:.0f}" if isinstance(number, float) else str(number)
         raise LimitError(
-            f"{place + ': ' if place else ''}{number:,} {LIMITS[name].meaning}; at most {limit:,} are accepted. If the"
-            f" file can be trusted, set {PREFIX}{name.upper()}={plain} to raise the limit"
+            f"{place + ': ' if place else ''}{'at least ' * is_partial}{number:,} {LIMITS[name].meaning}; at most"
+            f" {limit:,} are accepted. If the file can be trusted, set {PREFIX}{name.upper()}={plain}"
+            f"{' or more' * is_partial} to raise the limit"
         )

@@ -165,13 +165,22 @@ def wait_until(condition: Callable[[], bool], seconds: float) -> None:
         time.sleep(0.02)
 
 
+def format_address(address: str, token_file: str) -> str:
+    """Return an address that others on the network can open; a token of the user's own does not appear in logs."""
+    for wildcard in ("//0.0.0.0:", "//[::]:"):
+        address = address.replace(wildcard, f"//{socket.gethostname()}:")
+    return f"{address.split('?')[0]}?token=TOKEN, with the content of {token_file}" if token_file else address
+
+
 def main(config: Config) -> None:
     studio = serve_studio(config)
-    print(f"studio: {studio.address}", flush=True)
+    print(f"studio: {format_address(studio.address, config.token_file)}", flush=True)
     ended = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ended.set())  # A service manager stops the studio with SIGTERM.
     try:
         while studio.thread.is_alive() and not ended.wait(0.5):
             pass
+    except KeyboardInterrupt:
+        print("the studio ends; the scenes of its visitors are lost")
     finally:
         studio.stop()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
@@ -132,6 +133,8 @@ def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) ->
         exit_with_error(renamed)
     if not {"-h", "--help"}.isdisjoint(words):
         hide_empty_defaults(options)
+        if hasattr(signal, "SIGPIPE"):
+            signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `--help | head` ends silently.
     default = {"default": options.DEFAULT} if hasattr(options, "DEFAULT") else {}
     config = tyro.cli(options.Config, args=words, prog=prog, description=options.__doc__, **default)
     set_ray_environment()

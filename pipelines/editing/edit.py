@@ -32,6 +32,7 @@ from models.scene import (
 from pipelines.editing.repair import GroundFaults, find_removable_objects, separate_objects, snap_to_ground
 from pipelines.metrics.validity import SLAB_OFFSET_M
 from pipelines.schema.tables import PRIMITIVES, make_primitives_table
+from pipelines.schema.validation import MAX_COORDINATE_M
 
 SIZES_M = (1e-3, 1e3)  # Smallest and largest size after an edit.
 WHERE_S, WHERE_MEMORY = 10.0, "1GB"  # Largest time (s) and memory of an SQL condition.
@@ -66,7 +67,7 @@ class Select:
 
     def _check_names(self) -> None:
         if self == Select():
-            raise ValueError("the selection has no condition; give category, primitives, instances, polygon-m or where")
+            raise ValueError("the selection has no condition; give category, primitives, instances, polygon_m or where")
         for name in self.category:
             _parse_category(name)
         if len(self.polygon_m) % 2:
@@ -190,7 +191,8 @@ class ObjectEdit(Edit):
         Returns:
             The edited scene, and the indices 0 .. n - 1, because no primitive changes its index.
         """
-        part = require_valid_objects(self.transform(scene.select(chosen)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            part = require_valid_objects(self.transform(scene.select(chosen)))
         place = np.arange(len(scene))
         place[chosen] = len(scene) + np.arange(len(part))
         return replace(scene, **concatenate_primitives([scene, part])).select(place), np.arange(len(scene))
@@ -206,10 +208,14 @@ def require_valid_objects(part: Scene) -> Scene:
         The same scene.
 
     Raises:
-        ValueError: A position is not finite, or a size lies outside 1 mm to 1 km.
+        ValueError: A position is not finite or too far away for the tables, or a size lies outside 1 mm to 1 km.
     """
     size_m = part.size_m
-    if not (np.isfinite(part.center_m).all() and ((size_m >= SIZES_M[0]) & (size_m <= SIZES_M[1])).all()):
+    if not (np.abs(part.center_m) <= MAX_COORDINATE_M).all():
+        raise ValueError(
+            f"a primitive of scene {part.scene_id} would lie beyond {MAX_COORDINATE_M:,.0f} m; use a shorter way"
+        )
+    if not ((size_m >= SIZES_M[0]) & (size_m <= SIZES_M[1])).all():
         raise ValueError(
             f"a primitive of scene {part.scene_id} would have a size outside 1 mm to 1 km or a value that is not finite"
         )
@@ -503,8 +509,11 @@ def _raise_objects(part: Scene, up_m: np.ndarray) -> np.ndarray:
 
 
 def _check_way(by_m: Sequence[float]) -> None:
-    if not np.isfinite(by_m).all() or not any(by_m):
-        raise ValueError(f"by_m is {list(by_m)}, expected finite metres along x, y and z that are not all 0")
+    if not (np.abs(by_m) <= MAX_COORDINATE_M).all() or not any(by_m):
+        raise ValueError(
+            f"by_m is {list(by_m)}, expected metres along x, y and z that are not all 0 and at most"
+            f" {MAX_COORDINATE_M:,.0f}"
+        )
 
 
 def _parse_category(name: str) -> int:

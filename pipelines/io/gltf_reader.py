@@ -135,12 +135,15 @@ def place_parts(parts: list[MeshPart]) -> list[np.ndarray]:
 
 def _read_chunks(data: bytes) -> tuple[bytes, memoryview]:
     """Return the JSON chunk and the binary chunk. An absent binary chunk is returned as empty."""
+    if not data:
+        raise ValueError("the file is empty; export it again as .glb")
     if data[:4] != b"glTF" or len(data) < 20:
         raise ValueError(f"the file begins with {data[:4]!r} and is not a binary glTF file; export as .glb")
     version, length = struct.unpack_from("<II", data, 4)
     if version != 2 or length != len(data):
         raise ValueError(
-            f"glTF version {version} with {len(data)} of {length} bytes; expected a whole file of version 2"
+            f"the file has {len(data)} bytes and states {length} bytes of glTF version {version}; expected a whole file"
+            " of version 2: copy or export it again"
         )
     chunks, start, whole = [], 12, memoryview(data)
     while start < length:
@@ -207,16 +210,16 @@ def _get_numbers(entry: dict, key: str, count: int, place: str) -> list[float]:
         raise ValueError(f"{place}: {key!r} has {len(values)} values, expected {count}; export it again")
     for value in values:
         if type(value) not in (int, float) or not -HUGE <= value <= HUGE:
-            raise ValueError(f"{place}: {key!r} holds {_show(value)}, expected numbers; export it again")
+            raise ValueError(
+                f"{place}: {key!r} holds {_show(value)}, expected numbers within {HUGE:g}; export it again"
+            )
     return [float(value) for value in values]
 
 
 def _pick(entries: list, index: Any, place: str, kind: str) -> Any:
     """Return the entry with an index, which may not be negative, as negative indices count from the end in Python."""
     if type(index) is not int or not 0 <= index < len(entries):
-        raise ValueError(
-            f"{place} refers to {kind} {_show(index)}, but the file has {len(entries)} {kind}s; export it again"
-        )
+        raise ValueError(f"{place} refers to {kind} {_show(index)}, but the file has {len(entries)}; export it again")
     return entries[index]
 
 
@@ -275,11 +278,11 @@ class _Reader:
             primitives = self._list_primitives(mesh, f"node {index}")
             placements += len(primitives)
             if placements > most_placements:
-                require_within("glb_placements", placements, f"node {index}")
+                require_within("glb_placements", placements, f"node {index}", is_partial=True)
             if mesh not in self.sizes:
                 self.sizes[mesh] = sum(self._count_numbers(entry, f"mesh {mesh}") for entry in primitives)
                 total += self.sizes[mesh]
-                require_within("glb_vertices", total, f"mesh {mesh}")
+                require_within("glb_vertices", total, f"mesh {mesh}", is_partial=True)
             if "skin" in node:
                 raise ValueError(f"node {index} has a skin, which is not read; export it without an armature")
             _refuse_morphs(node, f"node {index}")

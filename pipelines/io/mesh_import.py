@@ -115,7 +115,7 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
             )
     nodes = [part for part in glb.parts if "category" in part.extras]
     require_within("scene_primitives", len(nodes))
-    letters = find_limit("text_letters")
+    letters = find_limit("text_characters")
     fields = [_read_primitive(part.extras, f"the extras of node {part.node}") for part in nodes]
     for text in (
         *(field.label for field in fields),
@@ -125,7 +125,7 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
         about["split"],
     ):
         if len(text) > letters:
-            require_within("text_letters", len(text), "a label or an id")
+            require_within("text_characters", len(text), "a label or an id")
     category = np.array([field.category for field in fields], np.int8)
     size_said_m = np.array([field.size_m for field in fields], float).reshape(-1, 3)
     yaw_said, heading, existence = (

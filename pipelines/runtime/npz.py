@@ -1,8 +1,8 @@
 """Read .npz archives of unknown origin: an array is valid in full, or an error names the file, the array and the fault.
 
-The reader accepts what numpy.savez and numpy.savez_compressed write. It compares the shape and the type that an array
-states with the size of its zip entry and with the limit array_bytes before it decompresses the numbers, and it
-verifies the checksum. It does not read pickled objects.
+The reader accepts arrays of integers, floats and texts that numpy.savez or numpy.savez_compressed wrote. It compares
+the shape and the type that an array states with the size of its zip entry and with the limit array_bytes before it
+decompresses the numbers, and it verifies the checksum. It does not read pickled objects.
 """
 
 from __future__ import annotations
@@ -33,6 +33,10 @@ SHOWN = 5  # Maximum number of names in an error message.
 
 class NpzError(ValueError):
     """Raised if an archive is missing, damaged or not acceptable. The message names the file."""
+
+
+class _TypeProblem(ValueError):
+    """Raised if an array is intact but has a type that is not read."""
 
 
 class ArrayHeader(NamedTuple):
@@ -152,7 +156,10 @@ class NpzArchive:
         with self._open_entry(name) as (stream, header):
             rows, *inner = header.shape
             if header.is_fortran or not math.prod(inner):
-                raise NpzError(f"{self.uri}: array {name!r} of shape {header.shape} has no rows in C order")
+                raise NpzError(
+                    f"{self.uri}: array {name!r} of shape {header.shape} is in Fortran order or has empty rows; save"
+                    " numpy.ascontiguousarray of it, with rows that are not empty"
+                )
             row_bytes = math.prod(inner) * header.dtype.itemsize
             require_within("array_bytes", min(batch, rows) * row_bytes, f"{self.uri}: a batch of array {name!r}")
             for start in range(0, rows, batch):
@@ -165,7 +172,9 @@ class NpzArchive:
         """Yield the stream at the first number of an array, and the header of the array."""
         if name not in self.names:
             shown = ", ".join(map(_shorten, self.names[:SHOWN])) + ", ..." * (len(self.names) > SHOWN)
-            raise NpzError(f"{self.uri}: no array {name!r}, only {shown or 'nothing'}")
+            raise NpzError(
+                f"{self.uri}: no array {name!r}, only {shown or 'nothing'}; save the array under the name {name!r}"
+            )
         place = f"array {name!r}"
         entry = self._archive.getinfo(name + SUFFIX)
         if entry.flag_bits & ENCRYPTED:
@@ -255,6 +264,8 @@ def _name_errors(uri: str, place: str = "") -> Iterator[None]:
         yield
     except NpzError:
         raise
+    except _TypeProblem as error:
+        raise NpzError(f"{uri}: {place} {error}") from error
     except Exception as error:
         what = f"{place} is damaged" if place else "damaged or not an .npz archive"
         shown = str(error)[:200] or type(error).__name__
@@ -277,9 +288,9 @@ def _read_header(stream: Any) -> tuple[ArrayHeader, int]:
     if any(type(size) is not int or size < 0 for size in shape):
         raise ValueError(f"its shape is {str(shape)[:80]}")
     if dtype.hasobject:
-        raise ValueError("it holds pickled objects, which are not read; save the array as plain numbers")
+        raise _TypeProblem("holds pickled objects, which are not read; save the array as plain numbers")
     if dtype.kind not in PLAIN_KINDS or dtype.subdtype:
-        raise ValueError(f"its type is {str(dtype)[:80]}; save the array as plain numbers")
+        raise _TypeProblem(f"has the type {str(dtype)[:80]}; convert it to integers, floats or texts and save it again")
     return ArrayHeader(shape, dtype, bool(is_fortran) and len(shape) > 1), len(prefix) + len(sized) + len(text)
 
 

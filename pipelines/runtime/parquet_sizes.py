@@ -1,7 +1,7 @@
 """Measure the columns of a Parquet file before a library decodes them.
 
 The metadata of a Parquet file only state sizes; the headers of the pages determine how much memory a reader allocates.
-A page of some hundred bytes can hold two billion values. Some damaged metadata also make pyarrow end the process
+A page of a few hundred bytes can hold two billion values. Some damaged metadata also make pyarrow end the process
 (`RowGroupMetaData.column` cannot report errors). This module therefore parses footer and page headers in Python. They
 are structures in Thrift's compact protocol (github.com/apache/parquet-format).
 """
@@ -17,7 +17,7 @@ ITEM_BYTES = 8  # Upper bound of the size of a number and of an index into a dic
 MAX_DEPTH = 16  # Structures of the format are nested at most about 8 deep.
 SHORT_BYTES, LONG_BYTES = 2**10, 2**20  # Bytes to read for a page header.
 DATA_PAGES, DICTIONARY_PAGE = (0, 3), 2
-PAGES, ENCODINGS = frozenset(range(4)), frozenset(range(10))  # Numbers of the types that exist.
+PAGES, ENCODINGS = frozenset(range(4)), frozenset(range(10)) - {1}  # Numbers that exist; the encoding 1 was never used.
 
 Struct = dict[int, Any]
 
@@ -193,6 +193,8 @@ def _measure_pages(file: Any, column: Struct, end: int) -> tuple[int, int, bool]
     starts = [_require_count(column[key]) for key in (9, 11) if column.get(key)]
     if not starts and not wanted:
         return 0, 0, False  # A table without rows.
+    if not starts:
+        raise ValueError("a column has values but states no position")
     place = min(starts)
     last = place + stored
     if place < 4 or last > end:

@@ -21,7 +21,8 @@ from pipelines.runtime.parquet_sizes import ITEM_BYTES, measure_columns
 pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
 
 TEMPORARY = ".tmp-"
-TEXT_BYTES = 2**28  # Texts of a column that surely have fewer bytes are decoded directly.
+# A text column that can exceed this size (bytes) is read with dictionary encoding until its total length is known.
+TEXT_BYTES = 2**28
 
 
 def resolve_uri(uri: str | os.PathLike) -> tuple[pafs.FileSystem, str]:
@@ -127,13 +128,18 @@ def read_parquet(
     """
     fs, path = resolve_uri(uri)
     try:
-        with fs.open_input_file(path) as stream:
+        opened = fs.open_input_file(path)
+    except OSError as error:
+        raise ValueError(f"{uri}: cannot be opened ({error}); check the path, permissions and connection") from error
+    try:
+        with opened as stream:
             table = _read_checked(stream, columns, schema, encoded)
     except (LimitError, SchemaError) as error:
         raise ValueError(f"{uri}: {error}") from error
     except Exception as error:  # A damaged file makes pyarrow raise errors of many types.
         raise ValueError(
-            f"{uri}: cannot be read as Parquet ({error}); delete the file and run the job that wrote it again"
+            f"{uri}: cannot be read as Parquet ({error}); restore the file from a copy, or delete it and run the job"
+            " that wrote it again"
         ) from error
     return table
 
@@ -151,7 +157,10 @@ def _read_checked(stream: Any, columns: list[str] | None, schema: pa.Schema | No
         kind = found.field(name).type if len(found.get_all_field_indices(name)) == 1 else None
         if kind is None or (schema is not None and kind != schema.field(name).type):
             expected = "" if schema is None else f" or not of type {schema.field(name).type}"
-            raise SchemaError(f"column {name!r} is missing{expected}; another version wrote the file")
+            raise SchemaError(
+                f"column {name!r} is missing or occurs twice{expected}; run the job that writes the table again with"
+                " this version"
+            )
     num_rows, texts = _check_sizes(stream, found, wanted)
     options: Any = {"read_dictionary": [*texts, *encoded], "page_checksum_verification": True}
     with pq.ParquetFile(stream, metadata=metadata, **options) as file:
@@ -230,7 +239,7 @@ def read_bytes(uri: str, limit: str = "") -> bytes:
     except OSError as error:
         raise ValueError(f"{uri}: cannot be read ({error})") from error
     if limit:
-        require_within(limit, len(content), uri)
+        require_within(limit, len(content), uri, is_partial=True)
     return content
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from models.geometry.cholesky import compute_cholesky_parameters
+from models.limits import LimitError
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
 from pipelines.runtime import storage
 from pipelines.schema.validation import encode_texts, validate_shard, validate_table
@@ -571,6 +572,8 @@ class Shard:
         """Put the name of a table's file in front of an error."""
         try:
             yield
+        except LimitError as error:
+            raise LimitError(f"{self.path(table)}: {error}") from error
         except ValueError as error:
             raise ValueError(
                 f"{self.path(table)}: {error}; restore the shard or run the job that wrote it again"

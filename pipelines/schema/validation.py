@@ -1,7 +1,8 @@
 """Validate the tables of a shard: each table on its own, and the tables against each other.
 
 Readers validate before they build scenes, so a damaged or hostile file cannot produce wrong scenes or use up the
-memory. A table is valid in full, or an error names the row, the column and the value.
+memory. A table is valid in full, or an error names the row and the column, or the tables
+that disagree.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from models.scene import CATEGORIES, CATEGORY_INDEX, GROUND_CLASSES
 
 pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
 
-FAR_M = 1e6  # Largest accepted coordinate of a primitive and largest accepted size (m).
-ORTHONORMAL = 1e-3  # Largest accepted entry of R R^T - I.
+MAX_COORDINATE_M = 1e6  # Largest accepted coordinate of a primitive and largest accepted size (m).
+# Largest accepted |x|^2 - 1, |y|^2 - 1, x y and entry of x × y - z, for the columns x, y and z of a rotation.
+ORTHONORMAL_TOLERANCE = 1e-3
 DENSITIES = ("low", "medium", "high")
 KINDS = ("cuboid", "ellipsoid")
 
@@ -78,12 +80,12 @@ def encode_texts(column: pa.ChunkedArray) -> tuple[pa.Array, np.ndarray]:
 def _require_texts(table: pa.Table, name: str) -> None:
     _require_present(table, name)
     texts, index = encode_texts(table[name])
-    limit = find_limit("text_letters")
+    limit = find_limit("text_characters")
     if (pc.max(pc.binary_length(texts)).as_py() or 0) <= limit:  # A letter has at least one byte.
         return
     letters = pc.utf8_length(texts).to_numpy()[index]
     if letters.max() > limit:
-        require_within("text_letters", int(letters.max()), f"row {int(letters.argmax())}, column {name!r}")
+        require_within("text_characters", int(letters.max()), f"row {int(letters.argmax())}, column {name!r}")
 
 
 def _require_choice(table: pa.Table, name: str, choices: Sequence[str], is_optional: bool = False) -> None:
@@ -110,9 +112,11 @@ def _validate_scene_ids(table: pa.Table, name: str) -> None:
     _require_texts(table, name)
     names, seen = table[name].to_pylist(), set()
     if "" in names:
-        _refuse(table, name, np.array([n == "" for n in names]), "an id")
+        _refuse(table, name, np.array([n == "" for n in names]), "an id that is not empty")
     if len(set(names)) != len(names):
-        _refuse(table, name, np.array([n in seen or seen.add(n) is not None for n in names]), "an id of only one row")
+        _refuse(
+            table, name, np.array([n in seen or seen.add(n) is not None for n in names]), "an id that no other row has"
+        )
 
 
 def _validate_poses(table: pa.Table, name: str) -> None:
@@ -138,7 +142,7 @@ def _validate_rotations(table: pa.Table, name: str) -> None:
             np.maximum(worst, np.abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] - wanted), out=worst)
         for k in range(3):  # In a right-handed system, z is the cross product of x and y.
             np.maximum(worst, np.abs(x[k - 2] * y[k - 1] - x[k - 1] * y[k - 2] - z[k]), out=worst)
-        bad = ~(worst <= ORTHONORMAL)
+        bad = ~(worst <= ORTHONORMAL_TOLERANCE)
     _refuse(table, name, bad, "an orthonormal, right-handed matrix")
 
 
@@ -160,7 +164,7 @@ def _validate_classes(table: pa.Table, name: str) -> None:
     for row, classes in enumerate(table[name].to_pylist()):
         if not classes or len(set(classes)) != len(classes) or not set(classes) <= set(GROUND_CLASSES):
             names = ", ".join(GROUND_CLASSES)
-            _refuse(table, name, np.arange(len(table)) == row, f"different names out of {names}")
+            _refuse(table, name, np.arange(len(table)) == row, f"one or more distinct names out of {names}")
 
 
 def _make_number_rule(low: float, high: float, expected: str, is_optional: bool = False) -> Callable:
@@ -172,13 +176,17 @@ def _make_choice_rule(choices: Sequence[str], is_optional: bool = False) -> Call
 
 
 _FINITE = _make_number_rule(-np.inf, np.inf, "a finite number")
-_COUNT = _make_number_rule(0, np.inf, "a number of at least 0")
+_COUNT = _make_number_rule(0, np.inf, "a finite number of at least 0")
 _AREA = _make_number_rule(0, np.inf, "a finite number of at least 0, or null", is_optional=True)
-_NEAR = _make_number_rule(-FAR_M, FAR_M, f"a coordinate within {FAR_M:,.0f} m")
-_SIZE = _make_number_rule(float(np.finfo(np.float32).tiny), FAR_M, f"a positive size of at most {FAR_M:,.0f} m")
+_NEAR = _make_number_rule(-MAX_COORDINATE_M, MAX_COORDINATE_M, f"a coordinate within {MAX_COORDINATE_M:,.0f} m")
+_SIZE = _make_number_rule(
+    float(np.finfo(np.float32).tiny), MAX_COORDINATE_M, f"a positive size of at most {MAX_COORDINATE_M:,.0f} m"
+)
 _ANGLE = _make_number_rule(-3.1416, 3.1416, "an angle in [-pi, pi]")
 _HEADING = _make_number_rule(-3.1416, 3.1416, "an angle in [-pi, pi], or null", is_optional=True)
-_POSITIVE = _make_number_rule(float(np.finfo(np.float64).tiny), FAR_M, "a positive number")
+_POSITIVE = _make_number_rule(
+    float(np.finfo(np.float64).tiny), MAX_COORDINATE_M, f"a positive number of at most {MAX_COORDINATE_M:,.0f}"
+)
 
 # For each table, the rule of each column.
 RULES: Mapping[str, Mapping[str, Callable[[pa.Table, str], None]]] = {
@@ -211,7 +219,7 @@ RULES: Mapping[str, Mapping[str, Callable[[pa.Table, str], None]]] = {
         "scene_id": _require_present,
         **dict.fromkeys(("height", "occupied"), _require_present),
         **dict.fromkeys(("resolution_m", "height_step_m"), _POSITIVE),
-        **dict.fromkeys(("rows", "cols"), _make_number_rule(1, np.inf, "a number of at least 1")),
+        **dict.fromkeys(("rows", "cols"), _make_number_rule(1, np.inf, "a finite number of at least 1")),
         **dict.fromkeys(("front_m", "left_m"), _NEAR),
         "ground_classes": _validate_classes,
     },
@@ -302,7 +310,7 @@ def validate_shard(scenes: pa.Table, primitives: pa.Table, rasters: pa.Table | N
         row = int(np.argmax(bad))
         raise ValueError(
             f"scenes, row {row}, column 'primitive_offset': {offsets[row]}, expected {ends[row] - counts[row]}, the"
-            " number of primitives of the scenes before it"
+            " number of primitives of the scenes before it; this value or an earlier num_primitives is wrong"
         )
     if (total := int(ends[-1]) if len(ends) else 0) != len(primitives):
         raise ValueError(f"primitives has {len(primitives)} rows, but the scenes of the shard have {total} primitives")

@@ -14,7 +14,7 @@ from fastapi import Request, Response
 from fastapi.responses import RedirectResponse
 
 MAX_BODY_BYTES = 256 * 1024  # Maximum size of a request (bytes).
-MIN_TOKEN_LETTERS = 16
+MIN_TOKEN_CHARACTERS = 16
 COOKIE, COOKIE_AGE_S = "studio", 24 * 3600
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 HEADERS = {
@@ -54,8 +54,10 @@ class Gate:
     key: bytes = field(default=b"", repr=False)
 
     def __post_init__(self) -> None:
-        if self.token and len(self.token) < MIN_TOKEN_LETTERS:
-            raise ValueError(f"the token has {len(self.token)} letters, expected at least {MIN_TOKEN_LETTERS}")
+        if self.token and len(self.token) < MIN_TOKEN_CHARACTERS:
+            raise ValueError(
+                f"the token of --token-file has {len(self.token)} characters; write at least {MIN_TOKEN_CHARACTERS}"
+            )
         if not self.key:
             own = hashlib.sha256(b"cookies of the studio" + self.token.encode()).digest()
             object.__setattr__(self, "key", own if self.token else secrets.token_bytes(32))
@@ -67,17 +69,19 @@ class Gate:
         except ValueError:
             return Response("malformed host name", 400)
         if self.hosts and host not in self.hosts:
-            return Response("unknown host name; see --host-names", 421)
+            return Response(
+                "unknown host name; open the address that jobs/serve_studio.py printed, or name it in --host-names", 421
+            )
         if request.method not in ("GET", "HEAD", "POST"):
             return Response("the studio answers GET and POST", 405, {"Allow": "GET, HEAD, POST"})
         # Pages of other origins cannot set a custom header.
         if request.method == "POST" and request.headers.get("x-studio") != "1":
             return Response("the request does not come from the page of the studio", 403)
         if "transfer-encoding" in request.headers:
-            return Response("the request states no length", 411)
+            return Response("Transfer-Encoding is not accepted; send Content-Length", 411)
         length = request.headers.get("content-length", "0")
         if not length.isdecimal():
-            return Response("malformed length", 400)
+            return Response("malformed Content-Length", 400)
         if int(length) > MAX_BODY_BYTES:
             return Response(f"the request is larger than {MAX_BODY_BYTES:,} bytes", 413)
         return None

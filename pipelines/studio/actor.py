@@ -1,7 +1,7 @@
 """Run the studio in a Ray actor: one process holds the model and the sessions of all visitors.
 
-The actor has no name and listens on no port of its own. Ray Serve is not used: each of its replicas listens on all
-network interfaces, and its proxy answers some addresses without access control.
+The actor has no name and runs no HTTP server; only Ray's internal ports reach it. Ray Serve is not used: each of its
+replicas listens on all network interfaces, and its proxy answers some addresses without access control.
 """
 
 from __future__ import annotations

@@ -63,7 +63,9 @@ def build_studio_app(backend: Backend, gate: Gate) -> FastAPI:
                     gate.issue_cookie(response)
             else:
                 fix = "open the address that jobs/serve_studio.py printed" if gate.token else "reload the page"
-                response = to_response(make_json_answer({"detail": f"your session has expired; {fix}"}, 401))
+                response = to_response(
+                    make_json_answer({"detail": f"your cookie is missing or has expired; {fix}"}, 401)
+                )
         response.headers.update(HEADERS)
         return response
 

@@ -190,7 +190,7 @@ class SessionStore:
         """Make all sessions fit into `total_bytes` after an operation of one session.
 
         The undo histories of the least recently used sessions are dropped first, then sessions that are idle for
-        `protected_s`, then the history of `current`. If this is not enough, the operation is revoked.
+        `protected_s`, then the history of `current`. If this is not enough, the operation is undone.
 
         Args:
             current: Session that has changed.

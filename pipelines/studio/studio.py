@@ -95,6 +95,13 @@ class Studio:
                 catalogue.scenes.select(["scene_id", "vegetation_density", "num_primitives"]).to_pylist()
             )
         ]
+        roots: dict[str, str] = {}
+        for _, catalogue, _, row in self.listed:
+            if (root := roots.setdefault(row["scene_id"], catalogue.root)) is not catalogue.root:
+                raise ValueError(
+                    f"scene {row['scene_id']!r} is in {root} and in {catalogue.root}; give one of these directories, or"
+                    " sample again with another --run"
+                )
         self.sessions, self.tasks = SessionStore(self.limits), TaskQueue(self.limits)
 
     def answer(self, operation: str, visitor: str, request: BaseModel | None = None) -> Answer:

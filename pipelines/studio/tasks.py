@@ -88,14 +88,14 @@ class TaskQueue:
             raise StudioError(
                 f"{task.name} needs {task.total:,} network evaluations, and the studio accepts"
                 f" {limits.request_evaluations:,} per request; use fewer steps, fewer resamplings or a smaller region,"
-                " or a job instead of the studio"
+                " or run jobs/inpaint_scenes.py or jobs/outpaint_scenes.py"
             )
         with self.condition:
             if any(other.visitor == task.visitor for other in self._list_active()):
                 raise StudioError("your last task is still running; wait for it or cancel it", 429, 1)
             if len(self.waiting) >= limits.max_waiting:
                 raise StudioError(
-                    f"{len(self.waiting)} tasks are waiting; try again in a minute",
+                    f"the queue is full ({len(self.waiting)} tasks are waiting); try again in a minute",
                     429,
                     self._estimate(self.waiting) or 60,
                 )
@@ -111,7 +111,7 @@ class TaskQueue:
             self.condition.notify()
 
     def cancel(self, task: BackgroundTask) -> None:
-        """Cancel a task. A waiting task ends at once, a running task after its current network evaluation."""
+        """Cancel a task. A waiting task ends immediately, a running task after its current network evaluation."""
         with self.condition:
             task.cancelled = True
             if task in self.waiting:

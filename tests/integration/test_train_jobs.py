@@ -238,4 +238,4 @@ def test_encode_reports_worker_error_in_one_line(home, tmp_path):
     done = run_command("jobs/encode_latents.py", *words)
     lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert done.returncode == 2 and len(lines) == 1, done.stderr[-2000:]
-    assert path.name in lines[0] and "delete the file and run the job that wrote it again" in lines[0]
+    assert path.name in lines[0] and "delete it and run the job that wrote it again" in lines[0]

@@ -207,9 +207,18 @@ def test_snap_leaves_nothing_floating_or_sunken(town_scenes):
 
 
 def test_edit_rejects_degenerate_primitive(scene):
-    for wrong in (edit.Scale(ALL, (0, 1, 1)), edit.Scale(ALL, (1e6, 1, 1)), edit.Translate(ALL, (np.inf, 0, 0))):
-        with pytest.raises(ValueError, match=rf"edit 0 \({wrong.name}\): .*size outside 1 mm to 1 km"):
+    far, large = "would lie beyond 1,000,000 m", "size outside 1 mm to 1 km"
+    for wrong, reason in (
+        (edit.Scale(ALL, (0, 1, 1)), large),
+        (edit.Scale(ALL, (1e6, 1, 1)), large),
+        (edit.Translate(ALL, (np.inf, 0, 0)), far),
+        (edit.Translate(ALL, (1e30, 0, 0)), far),  # Tables refuse such a position.
+        (edit.Rotate(ALL, 90, about_m=(1e9, 0)), far),
+    ):
+        with pytest.raises(ValueError, match=rf"edit 0 \({wrong.name}\): .*{reason}"):
             replay_edits(scene, [wrong])
+    with pytest.raises(ValueError, match="at most 1,000,000"):
+        edit.Translate(ALL, (1e30, 0, 0)).check()
 
 
 # --------------------------------------------------------------------------------------------------------- repair

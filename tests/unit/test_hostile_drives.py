@@ -74,7 +74,7 @@ def make_box_table(rows: int, **changes) -> pa.Table:
 def test_small_table_with_many_rows_is_refused(drives):
     path = replace_table(drives, "boxes", make_box_table(2_100_000), compression="zstd")
     assert path.stat().st_size < 1_000_000
-    refuse(drives, "2,100,000 rows of a table file")
+    refuse(drives, "2,100,000 rows, objects")
 
 
 def test_dictionary_of_long_texts_is_not_decoded(drives):
@@ -99,7 +99,7 @@ def test_list_column_with_many_entries_is_refused(drives, monkeypatch):
     outline = pa.ListArray.from_arrays([0, 7_000_000], pa.array(np.zeros(7_000_000, np.int8)))
     table = pa.table({"class": ["road"], "outline": outline})
     assert replace_table(drives, "polygons", table, compression="zstd").stat().st_size < 50_000
-    refuse(drives, "bytes of the columns")
+    refuse(drives, "bytes in memory of the columns")
 
 
 def test_nested_lists_are_counted_before_they_become_objects(drives):
@@ -207,7 +207,7 @@ def test_damaged_footer_does_not_end_process(drives):
     ("content", "message"),
     [
         ("[" * 100_000, "nested too deeply"),
-        ("[" + "[]," * 9_000_000 + "[]]", "commas, colons and brackets"),
+        ("[" + "[]," * 9_000_000 + "[]]", "commas, colons and opening brackets"),
         ('[{"frame": 1, "frame": 2}]', "'frame' occurs twice"),
         ('[{"frame": ' + "9" * 5_000 + "}]", "broken JSON"),
         ('[{"frame": [' + "[" * 300 + "]" * 301 + "}]", r"frame of row 0 is \[\[\["),
@@ -324,7 +324,7 @@ def test_ground_with_many_layers_needs_little_memory(monkeypatch):
     assert measure_peak_gb() - before < 0.4
     assert occupied.any() and np.allclose(height_m[occupied], 0.999)
     monkeypatch.setenv("PRITTI_MAX_SCENE_COVERAGE", "10000000")
-    with pytest.raises(LimitError, match=r"ground triangles: .* pixels of the bounding boxes"):
+    with pytest.raises(LimitError, match=r"ground triangles: .* pixels visited"):
         ground.rasterise(pose, Grid(), 1)
     polygon = corners[:, :2] * 0.1
     many = MapGround([0] * 500, [polygon] * 500, np.zeros((10, 10)), np.eye(3))
@@ -406,7 +406,7 @@ def test_objects_in_one_place_do_not_take_quadratic_time(tmp_path):
     ("poses", "message"),
     [
         ("0 " + "1 " * 100_000 + "\n", "line 1: 200,002 letters"),
-        ("\n" * 2_100_000, "2,100,000 rows of a table file"),
+        ("\n" * 2_100_000, "2,100,000 rows, objects"),
         (POSES.replace("1", "nan"), "is not a pose"),
         (POSES.replace("-1", "1e308"), "is not a pose"),
         (POSES + "1" * 400 + POSES[1:], "is not a whole number"),
@@ -457,7 +457,7 @@ def test_small_feather_file_with_large_columns_is_refused(log):
     assert path.stat().st_size < 100_000
     del columns
     before = measure_peak_gb()
-    with pytest.raises(LimitError, match=r"annotations.feather: 7,000,000 rows of a table file"):
+    with pytest.raises(LimitError, match=r"annotations.feather: 7,000,000 rows, objects"):
         argoverse2.read_drive(log.parents[1], "train", "log")
     assert measure_peak_gb() - before < 0.1
 

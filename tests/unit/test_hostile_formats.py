@@ -101,8 +101,11 @@ HOSTILE_VOXELS = {
     "huge": (zip_entries(("voxels.npy", make_npy(describe((2**20, 2**20, 2**20))))), "needs .* bytes, has 0"),
     "negative": (zip_entries(("voxels.npy", make_npy(describe((-32, -32, 4)), VOXELS.tobytes()))), "shape is"),
     "boolean": (zip_entries(("voxels.npy", make_npy(describe((True, 4096, 1)), VOXELS.tobytes()))), "shape is"),
-    "fields": (zip_entries(("voxels.npy", make_npy(describe((32, 32, 4), [("a", "|u1")]), bytes(4096)))), "its type"),
-    "void": (zip_entries(("voxels.npy", make_npy(describe((32, 32, 4), "|V1"), bytes(4096)))), "its type is"),
+    "fields": (
+        zip_entries(("voxels.npy", make_npy(describe((32, 32, 4), [("a", "|u1")]), bytes(4096)))),
+        "has the type",
+    ),
+    "void": (zip_entries(("voxels.npy", make_npy(describe((32, 32, 4), "|V1"), bytes(4096)))), "has the type"),
     "missing": (zip_entries(("voxels.npy", make_npy(describe((32, 32, 4)), bytes(4095)))), "4,096 bytes, has 4,095"),
     "trailing": (zip_entries(("voxels.npy", make_npy(describe((32, 32, 4)), bytes(4097)))), "4,096 bytes, has 4,097"),
     "version": (

@@ -390,7 +390,7 @@ FAULTS = {
     "beyond": (lambda: export_with_json(lambda t: t["accessors"][0].update(count=10**6)), "beyond its buffer"),
     "stride": (lambda: export_with_json(lambda t: t["bufferViews"][0].update(byteStride=0)), "beyond its buffer"),
     "many": (lambda: export_with_json(lambda t: t["accessors"][0].update(count=10**12)), "corners .* at most"),
-    "missing": (lambda: export_with_json(lambda t: t.pop("accessors")), "the file has 0 accessors"),
+    "missing": (lambda: export_with_json(lambda t: t.pop("accessors")), "the file has 0; export"),
     "number": (lambda: export_with_json(lambda t: t.update(nodes=7)), "'nodes' is 7, expected an array"),
     "grid": (
         lambda: export_with_json(lambda t: t["scenes"][0]["extras"]["grid"].update(rows=10**9)),

@@ -1,6 +1,7 @@
 """Tests of the studio without Ray: access control, malformed requests, budgets, the task queue and bounded sessions."""
 
 import asyncio
+import shutil
 import threading
 import time
 from dataclasses import replace
@@ -67,7 +68,7 @@ def test_token_is_exchanged_for_cookie_by_redirect(studio):
     assert TOKEN not in cookie and "HttpOnly" in cookie and "SameSite=lax" in cookie and "Secure" not in cookie
     assert client.get("/").status_code == 200 and client.get("/api/about").json()["labels"] == ["low", "medium", "high"]
     assert "Secure" in make_client(studio, Gate(is_encrypted=True, hosts=())).get("/").headers["set-cookie"]
-    with pytest.raises(ValueError, match="has 5 letters, expected at least 16"):
+    with pytest.raises(ValueError, match="has 5 characters; write at least 16"):
         Gate("short")
 
 
@@ -179,6 +180,12 @@ def wait_until(condition) -> None:
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.005)
+
+
+def test_studio_refuses_two_scenes_with_one_id(studio_files, tmp_path):
+    shutil.copytree(studio_files / "tables", tmp_path / "copy")
+    with pytest.raises(ValueError, match=r"scene 'given-0' is in .*tables and in .*copy; give one of these"):
+        Studio(str(studio_files / "model"), [str(studio_files / "tables"), str(tmp_path / "copy")])
 
 
 def test_queue_runs_visitor_with_least_use_first():

@@ -39,7 +39,7 @@ def replace_value(table: pa.Table, column: str, row: int, value) -> pa.Table:
 FLIPPED = [1.0, 0, 0, 0, 1, 0, 0, 0, -1]
 DAMAGES = [
     ("scenes", "scene_id", 1, None, "expected a value"),
-    ("scenes", "scene_id", 1, "", "expected an id"),
+    ("scenes", "scene_id", 1, "", "expected an id that is not empty"),
     ("scenes", "scene_id", 1, "x" * 2000, "at most 1,000 are accepted"),
     ("scenes", "frame", 0, None, "expected a value"),
     ("scenes", "x_m", 2, float("nan"), "nan, expected a finite number"),
@@ -49,7 +49,7 @@ DAMAGES = [
     ("scenes", "world_from_imu", 2, [1.0] * 11 + [None], "expected 12 finite numbers or null"),
     ("scenes", "vegetation_density", 1, "dense", "expected one of low, medium, high"),
     ("scenes", "road_area_m2", 1, -1.0, "expected a finite number of at least 0, or null"),
-    ("scenes", "num_primitives", 1, -1, "expected a number of at least 0"),
+    ("scenes", "num_primitives", 1, -1, "expected a finite number of at least 0"),
     ("scenes", "num_primitives", 1, 300_000, "300,000 primitives of a scene; at most 200,000"),
     ("scenes", "num_pole", 1, lambda count: count + 1, "but the primitives table holds"),
     ("scenes", "primitive_offset", 2, 41, "41, expected 40"),
@@ -82,8 +82,8 @@ DAMAGES = [
     ("rasters", "occupied", 2, lambda mask: mask[:-1], "bytes, expected"),
     ("rasters", "occupied", 2, lambda mask: bytes([mask[0] ^ 1]) + mask[1:], "two bytes for each set bit"),
     ("rasters", "height", 2, lambda height: height[:-2], "two bytes for each set bit"),
-    ("rasters", "ground_classes", 2, ["road"] * 5, "different names"),
-    ("rasters", "ground_classes", 2, ["lava"], "different names"),
+    ("rasters", "ground_classes", 2, ["road"] * 5, "one or more distinct names"),
+    ("rasters", "ground_classes", 2, ["lava"], "one or more distinct names"),
 ]
 
 
@@ -107,7 +107,7 @@ def test_tables_with_other_numbers_of_rows_are_refused(tables, tmp_path):
         with pytest.raises(ValueError, match=message):
             write_tables(tmp_path / table, short).scenes()
     twice = replace_value(tables["scenes"], "scene_id", 1, tables["scenes"]["scene_id"][0].as_py())
-    with pytest.raises(ValueError, match=r"row 1, column 'scene_id': .* an id of only one row"):
+    with pytest.raises(ValueError, match=r"row 1, column 'scene_id': .* an id that no other row has"):
         write_tables(tmp_path / "twice", tables | {"scenes": twice}).read("scenes")
 
 

@@ -237,7 +237,7 @@ def _read_texts(path: Path, name: str, column: pa.ChunkedArray) -> np.ndarray:
     for chunk in column.chunks:
         chunk = chunk if pa.types.is_dictionary(chunk.type) else pc.dictionary_encode(chunk)
         longest = pc.max(pc.utf8_length(chunk.dictionary)).as_py() or 0
-        require_within("text_letters", longest, f"{path}: a text in column {name}")
+        require_within("text_characters", longest, f"{path}: a text in column {name}")
         texts = np.array([*chunk.dictionary.to_pylist(), None], object)  # None keeps numpy from making an (n, m) array.
         values.append(texts[chunk.indices.to_numpy()])
     found = np.concatenate([np.zeros(0, object), *values])

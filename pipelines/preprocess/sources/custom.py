@@ -370,7 +370,7 @@ def _make_ground(table: DriveTable, classes: tuple[str, ...]) -> SurfaceGround:
     for row, value in enumerate(table.iterate("outline") if table.rows else ()):
         outline_m = _make_outline(table.path, row, value)
         points += len(outline_m)
-        require_within("table_rows", points, f"{table.path}: points of all outlines up to row {row}")
+        require_within("table_rows", points, f"{table.path}: points of outlines", is_partial=True)
         parts.append(_triangulate_polygon(table.path, row, outline_m))
     return SurfaceGround(
         triangles_m=np.concatenate([np.zeros((0, 3, 3)), *parts]),

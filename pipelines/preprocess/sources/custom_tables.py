@@ -270,14 +270,14 @@ def _check_column_sizes(path: Path, name: str, column: pa.ChunkedArray) -> None:
     for chunk in column.chunks:
         if pa.types.is_dictionary(chunk.type) and len(chunk.dictionary):
             longest = pc.max(pc.utf8_length(chunk.dictionary)).as_py() or 0
-            require_within("text_letters", longest, f"{path}: a text in column {name}")
+            require_within("text_characters", longest, f"{path}: a text in column {name}")
         elif _is_list(chunk.type):
             lengths = pc.list_value_length(chunk)
             longest = pc.max(lengths).as_py() or 0
             require_within(
                 "polygon_points", longest, f"{path}: row {pc.index(lengths, longest).as_py()}, column {name}"
             )
-            require_within("table_rows", len(chunk.flatten()), f"{path}: entries of the lists of column {name}")
+            require_within("table_rows", len(chunk.flatten()), f"{path}: column {name}")
             if _is_list(chunk.type.value_type):
                 longest = pc.max(pc.list_value_length(chunk.flatten())).as_py() or 0
                 if longest > MATRIX_ENTRIES:

@@ -211,7 +211,7 @@ class MapGround:
             if high[0] < grid.back_m or low[0] > grid.front_m or high[1] < grid.right_m or low[1] > grid.left_m:
                 continue
             work += x.size + len(local) * grid.rows
-            require_within("scene_coverage", work, "ground polygons")
+            require_within("scene_coverage", work, "ground polygons", is_partial=True)
             covered = fill_polygon(local, grid) & np.isfinite(surface)
             height[index][covered] = surface[covered]
         return _interpolate_heights(height)

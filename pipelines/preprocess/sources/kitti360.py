@@ -22,7 +22,7 @@ import numpy as np
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
-from models.limits import require_within
+from models.limits import LimitError, require_within
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES
 from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
 from pipelines.preprocess.sources.files import read_file
@@ -216,7 +216,7 @@ def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
     seen: dict[tuple, list[np.ndarray]] = {}
     dropped, unknown, duplicates, defects = Counter(), Counter(), 0, []
     for number, fields in enumerate(_stream_objects(path), 1):
-        require_within("table_rows", number, f"{path}: objects")
+        require_within("table_rows", number, str(path), is_partial=True)
         if len(defects) > MAX_DEFECTS or len(unknown) > MAX_LABELS:
             raise ValueError(
                 f"{path}: more than {MAX_DEFECTS:,} objects are defective, such as object {defects[0].index} "
@@ -370,6 +370,8 @@ def _stream_objects(path: Path) -> Iterator[dict]:
                     root.clear()
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror}); {again}") from error
+    except LimitError as error:
+        raise LimitError(f"{path}: {error}") from error
     except DefusedXmlException as error:
         raise ValueError(
             f"{path} declares a document type or entities, which files of KITTI-360 never do; {again}"
