@@ -139,7 +139,7 @@ def damage_meshes(folder: Path, good: bytes) -> dict[str, str]:
     """Write GLB files that are damaged in different ways, and return words of the expected reasons by scene id."""
     size = int.from_bytes(good[12:16], "little")
     faults = {
-        "empty": (b"", "not a binary glTF file"),
+        "empty": (b"", "the file is empty"),
         "cut": (good[:1000], "expected a whole file"),
         "nan": (good.replace(b'"matrix":[', b'"matrix":[NaN,', 1), "expected a whole file"),
         "json": (good[:20] + b"{" * size + good[20 + size :], "the JSON chunk is invalid"),
