@@ -215,6 +215,7 @@ def test_sample_loses_no_scene_after_actor_kill(smoke, samples, tmp_path):
     assert all(np.array_equal(a.occupied, b.occupied) for a, b in zip(again, before, strict=True))
 
 
+@pytest.mark.slow  # Sampling has the same tests with one block per scene.
 def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_path):
     from jobs.implementation.outpaint_scenes import count_blocks
     from jobs.outpaint_scenes import Config

@@ -160,6 +160,7 @@ def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monk
         train(Config(preset="smoke", name="dit-odd", num_workers=2, batch_size=7))
 
 
+@pytest.mark.slow  # test_train_dit_with_two_workers_matches_one_and_resumes uses the same trainer.
 def test_train_lvae_with_two_workers_matches_one(home):
     from jobs.implementation.train_lvae import train
     from jobs.train_lvae import Config
