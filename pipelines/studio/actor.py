@@ -6,6 +6,7 @@ replicas listens on all network interfaces, and its proxy answers some addresses
 
 from __future__ import annotations
 
+import logging
 import sys
 from typing import Any
 
@@ -16,6 +17,7 @@ from pydantic import BaseModel
 from pipelines.studio.limits import StudioLimits
 from pipelines.studio.studio import Answer, Studio, make_json_answer
 
+logger = logging.getLogger(__name__)
 THREADS = 16  # Number of requests that the actor works on at the same time.
 MAX_PENDING = 256  # Maximum number of requests that the actor has not answered; further requests are refused.
 
@@ -38,14 +40,23 @@ class StudioActor:
         if threads:
             torch.set_num_threads(threads)
         sys.setswitchinterval(0.001)  # Requests wait less for the thread that samples.
-        self.studio = Studio(model, datasets, limits)
+        self.error: ValueError | None = None
+        try:
+            self.studio = Studio(model, datasets, limits)
+        except ValueError as error:  # An error in __init__ would end the process, with a long log.
+            self.error = error
+            logger.error("studio: %s", error)
 
     def answer(self, operation: str, visitor: str, request: BaseModel | None) -> Answer:
         """Carry out one request (`Studio.answer`)."""
+        if self.error:  # The process has restarted, and the files have changed.
+            return make_json_answer({"detail": "the studio cannot read its files; its log has the reason"}, 503)
         return self.studio.answer(operation, visitor, request)
 
     def ready(self) -> bool:
-        """Return True when the model is loaded."""
+        """Return True when the model is loaded. Raises ValueError if the model or a dataset cannot be read."""
+        if self.error:
+            raise self.error
         return True
 
 
@@ -73,7 +84,11 @@ class ActorBackend:
             runtime_env={"env_vars": MALLOC},
         )
         self.actor = actor.remote(model, datasets, limits, threads)
-        ray.get(self.actor.ready.remote())
+        try:
+            ray.get(self.actor.ready.remote())
+        except ValueError as error:  # Ray's error is also of the type of its cause.
+            self.stop()
+            raise getattr(error, "cause", error) from None
 
     async def answer(self, operation: str, visitor: str, request: BaseModel | None = None) -> Answer:
         """Carry out one request (`Studio.answer`). If the actor is overloaded or restarts, the answer says so."""

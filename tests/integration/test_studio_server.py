@@ -120,3 +120,12 @@ def test_studio_rejects_taken_port_and_missing_inputs(studio_files, tmp_path):
         serve_studio(Config(str(tmp_path)))
     with pytest.raises(ValueError, match="holds no scenes"):
         serve_studio(Config(str(studio_files / "model"), (str(tmp_path),)))
+
+
+def test_studio_names_unusable_datasets(studio_files, cluster):
+    from jobs.implementation.serve_studio import serve_studio
+    from jobs.serve_studio import Config
+
+    tables = str(studio_files / "tables")
+    with pytest.raises(ValueError, match=r"^scene 'given-0' is in \S+tables and in \S+tables; give one of these"):
+        serve_studio(Config(str(studio_files / "model"), (tables, tables), port=0))
