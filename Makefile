@@ -2,7 +2,7 @@
 #
 #   make demo        train, sample and report with the demo preset
 #   make lint        ruff (rules and format) and pyright
-#   make test-fast   tests/unit: no Ray, no browser, about a minute
+#   make test-fast   tests/unit: no Ray, no browser, about three minutes
 #   make test        all tests but slow ones
 #   make test-slow   long checks, marked slow
 #   make docs        the documentation site in build/site; executes the tutorials

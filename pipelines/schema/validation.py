@@ -329,7 +329,8 @@ def validate_shard(scenes: pa.Table, primitives: pa.Table, rasters: pa.Table | N
     named = [name for name in CATEGORIES if f"num_{name}" in columns]
     if named and "category" in primitives.column_names:
         texts, index = encode_texts(primitives["category"])
-        category = np.array([CATEGORY_INDEX[text] for text in texts.to_pylist()] + [0])[index]
+        # A dictionary may hold unknown texts that no row uses.
+        category = np.array([CATEGORY_INDEX.get(text, 0) for text in [*texts.to_pylist(), None]])[index]
         found = np.bincount(owner * len(CATEGORIES) + category, minlength=len(scenes) * len(CATEGORIES))
         found = found.reshape(-1, len(CATEGORIES))[:, [CATEGORY_INDEX[name] for name in named]]
         stated = np.stack([scenes[f"num_{name}"].to_numpy() for name in named], axis=1)

@@ -13,6 +13,7 @@ from helpers import random_scene
 
 from pipelines.runtime import storage
 from pipelines.schema.tables import Shard, find_shards, make_scene_tables
+from pipelines.schema.validation import validate_shard, validate_table
 
 TABLES = ("scenes", "primitives", "rasters")
 
@@ -176,3 +177,14 @@ def test_small_files_cannot_use_up_memory(tmp_path):
     for line in lines:
         kib, message = line.split(" ", 1)
         assert int(kib) < 200_000 and "PRITTI_MAX_TABLE_" in message
+
+
+def test_unused_unknown_category_of_dictionary_is_accepted(tables):
+    category = tables["primitives"]["category"].combine_chunks().dictionary_encode()
+    larger = pa.DictionaryArray.from_arrays(
+        category.indices, pa.concat_arrays([category.dictionary, pa.array(["lava"])])
+    )
+    place = tables["primitives"].column_names.index("category")
+    primitives = tables["primitives"].set_column(place, "category", larger)
+    validate_table("primitives", primitives)
+    validate_shard(tables["scenes"], primitives, tables["rasters"])
