@@ -150,7 +150,7 @@ def measure_peak_memory(spacing_m: float, results: multiprocessing.Queue) -> Non
 
 def _write_one_shard(folder: str, results: multiprocessing.Queue) -> None:
     tasks = plan_kitti360(folder + "/raw", split=False)
-    shard_writer.write_shard(tasks[0], folder + "/out", Grid())
+    shard_writer.write_shard(tasks[0], folder + "/out", folder + "/out", Grid())
     poses = sum(len(task.parts[0].poses) for task in tasks)
     peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
     results.put((poses, int(peak.split()[1]) / 1024))

@@ -20,6 +20,7 @@ from typing import Annotated
 import tyro
 
 from jobs.support.cli import run
+from jobs.support.options import IfBusyOption
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class Encoding:
     """Maximum number of concurrent trials (default: one per CPU)."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/ablations/encoding)."""
+    if_busy: IfBusyOption = "refuse"
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ class Branches:
     """Name of the study and of its runs."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/ablations/<name>)."""
+    if_busy: IfBusyOption = "refuse"
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
+from jobs.support.options import IfBusyOption
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class Config:
     """Directory of the trained layout VAE (default: $PRITTI_HOME/models/lvae-town)."""
     output: str = ""
     """Directory to write latents/ and latents.json to (default: the dataset directory)."""
+    if_busy: IfBusyOption = "refuse"
     num_actors: int = 1
     """Number of models that run in parallel; use one per GPU."""
     batch_size: int = 16

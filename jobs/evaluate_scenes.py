@@ -40,6 +40,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import run
+from jobs.support.options import IfBusyOption
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,7 @@ class Config:
     """Number of scenes to show in each of two groups: the best and the worst reconstructions."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/<run>, or evaluations/latest without --run)."""
+    if_busy: IfBusyOption = "refuse"
     num_actors: int = 2
     """Number of models that run in parallel; use one per GPU."""
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
+from jobs.support.options import IfBusyOption
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ class Config:
     """Maximum number of scenes of each kind (generated, real), selected evenly (default: all)."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/seams)."""
+    if_busy: IfBusyOption = "refuse"
     num_actors: int = 2
     """Number of actors that run in parallel."""
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
+from jobs.support.options import IfBusyOption
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Config:
     """Evaluate only the scenes for which all files exist, instead of stopping at a missing file."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/voxels)."""
+    if_busy: IfBusyOption = "refuse"
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import run
-from jobs.support.options import SceneOptions
+from jobs.support.options import IfBusyOption, SceneOptions
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class Config(SceneOptions):
     """File formats to write."""
     output: str = ""
     """Directory to write to (default: export/ in the input directory)."""
+    if_busy: IfBusyOption = "refuse"
     overwrite: bool = False
     """Replace existing files."""
 

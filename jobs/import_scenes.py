@@ -21,6 +21,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jobs.support.cli import run
+from jobs.support.options import IfBusyOption
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,7 @@ class Config:
     """Directions of the axes in the files, such as x+ y- z- (default: x+ y- z- for meshes, x- y- z+ for voxels)."""
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/imported/<name>)."""
+    if_busy: IfBusyOption = "refuse"
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import resolve_path, run
-from jobs.support.options import RePaintOptions
+from jobs.support.options import IfBusyOption, RePaintOptions
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Config(RePaintOptions):
     """Number of different results per scene."""
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/inpainted)."""
+    if_busy: IfBusyOption = "refuse"
     run: str = "inpainted"
     """Name of the run: scenes get source=generated-<run>."""
     num_examples: int = 8

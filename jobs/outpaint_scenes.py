@@ -19,13 +19,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import resolve_path, run
-from jobs.support.options import RePaintOptions
+from jobs.support.options import IfBusyOption, RePaintOptions
 
 
 @dataclass(frozen=True)
 class Config(RePaintOptions):
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/outpainted)."""
+    if_busy: IfBusyOption = "refuse"
     run: str = "outpainted"
     """Name of the run: scenes get source=generated-<run>."""
     extent_m: tuple[float, float] | None = None

@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
+from jobs.support.options import IfBusyOption
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class Config:
     """Random seed of the noise, which is the same for every frame."""
     num_actors: int = 1
     """Number of pipelines that run in parallel; use one per GPU."""
+    if_busy: IfBusyOption = "refuse"
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jobs.support.cli import run
+from jobs.support.options import IfBusyOption
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class Town:
 
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/town)."""
+    if_busy: IfBusyOption = "refuse"
     num_train: int = 10_000
     """Number of training scenes."""
     num_test: int = 1_000
@@ -46,6 +48,7 @@ class Kitti360:
     """Root directory of KITTI-360."""
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/kitti360)."""
+    if_busy: IfBusyOption = "refuse"
     make_split: bool = True
     """Split each drive into training and test segments as in the paper; --no-make-split trains on every pose."""
     slots: Literal["p95", "paper"] = "p95"
@@ -63,6 +66,7 @@ class Av2:
     """Directory that contains train/ and val/."""
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/av2)."""
+    if_busy: IfBusyOption = "refuse"
     skip_unreadable: bool = False
     """Skip logs with unreadable files and list them in rejects; without this option, the job stops."""
 
@@ -75,6 +79,7 @@ class Own:
     """Directory that contains one directory per drive."""
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/own)."""
+    if_busy: IfBusyOption = "refuse"
     make_split: bool = True
     """Split each drive into training and test segments as in the paper; --no-make-split trains on every pose."""
     slots: Literal["p95", "paper"] = "p95"

@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
-from jobs.support.options import ModelOption
+from jobs.support.options import IfBusyOption, ModelOption
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class Config:
     """Name of the entry in the model zoo and of the registered model."""
     output: str = ""
     """Directory to write weights and model card to (default: $PRITTI_HOME/zoo/<name>)."""
+    if_busy: IfBusyOption = "refuse"
     register: bool = True
     """Also register the pipeline as a model version in MLflow."""
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
-from jobs.support.options import SceneOptions
+from jobs.support.options import IfBusyOption, SceneOptions
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class Config(SceneOptions):
     """Maximum number of scenes; the first scenes are used."""
     output: str = ""
     """Directory in which the job writes streets/ (default: the input directory)."""
+    if_busy: IfBusyOption = "refuse"
     run: str = "drive"
     """Name of the run and of its directory under streets/."""
     spacing_m: float = 1.0

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import run
-from jobs.support.options import ModelOption
+from jobs.support.options import IfBusyOption, ModelOption
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,7 @@ class Config:
     model: ModelOption = ""
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/generated)."""
+    if_busy: IfBusyOption = "refuse"
     run: str = "samples"
     """Name of the run: scenes get source=generated-<run>."""
     num_scenes: int = 64

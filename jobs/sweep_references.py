@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
+from jobs.support.options import IfBusyOption
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Config:
     """File of Inception weights; without this file, features come from an untrained network (default: none)."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/sweep)."""
+    if_busy: IfBusyOption = "refuse"
     num_actors: int = 2
     """Number of models that run in parallel; use one per GPU."""
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
-from jobs.support.options import ModelOption
+from jobs.support.options import IfBusyOption, ModelOption
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ class Config:
     """Number of scenes per setting that the page shows."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/samplers)."""
+    if_busy: IfBusyOption = "refuse"
     num_actors: int = 1
     """Number of pipelines that run in parallel; use one per GPU."""
 

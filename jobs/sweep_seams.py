@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import run
-from jobs.support.options import GenerationOptions
+from jobs.support.options import GenerationOptions, IfBusyOption
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ class Config(GenerationOptions):
     """Maximum number of real scenes, selected evenly."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/sweep-seams)."""
+    if_busy: IfBusyOption = "refuse"
     batch_size: int = 4
     """Number of blocks of a scene per batch; the batch size changes the result only by rounding."""
 

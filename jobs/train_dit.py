@@ -18,6 +18,7 @@ from typing import Literal
 import tyro
 
 from jobs.support.cli import run
+from jobs.support.options import IfBusyOption
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Config:
     """Name of the run; a run name is bound to its options (default: dit-<preset>)."""
     output: str = ""
     """Directory to write the trained pipeline to (default: $PRITTI_HOME/models/pritti-<name or preset>)."""
+    if_busy: IfBusyOption = "refuse"
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
     start_from: str = ""

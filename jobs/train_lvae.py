@@ -22,6 +22,7 @@ from typing import Literal
 import tyro
 
 from jobs.support.cli import run
+from jobs.support.options import IfBusyOption
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class Config:
     """Name of the run; a run name is bound to its options (default: lvae-<preset>)."""
     output: str = ""
     """Directory to write the trained model to (default: $PRITTI_HOME/models/<name>)."""
+    if_busy: IfBusyOption = "refuse"
     train_object_decoder_of: str = ""
     """Train only a new object decoder, for this pipeline; all values that --model of other jobs accepts are valid
     (default: train all parts)."""

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from models.limits import require_within
+from models.local_copy import make_local_copy
 from models.options import show_value
 from models.strict_json import parse_json
 
@@ -319,13 +320,14 @@ class ConfiguredModel(nn.Module):
     def from_pretrained(
         cls: type[Model], directory: str | os.PathLike, torch_dtype: torch.dtype | None = None
     ) -> Model:
-        """Load a model from a local directory written by `save_pretrained`.
+        """Load a model from a directory written by `save_pretrained`.
 
         The network is first built without memory (meta device). Memory is allocated after the size of the network and
         the header of the weights have been checked.
 
         Args:
-            directory: Directory with config.json and diffusion_pytorch_model.safetensors. Nothing is downloaded.
+            directory: Directory with config.json and diffusion_pytorch_model.safetensors: a path, or a URI such as
+                s3://bucket/folder, which is copied to the local cache (models/local_copy.py). Model hubs are not asked.
             torch_dtype: Data type of the parameters; None: float32.
 
         Returns:
@@ -335,7 +337,7 @@ class ConfiguredModel(nn.Module):
             ValueError: A file is missing or damaged, an entry of the config is invalid, the network exceeds a limit, or
                 the weights do not match the architecture in config.json.
         """
-        path = Path(directory)
+        path = Path(make_local_copy(directory, (CONFIG_NAME, WEIGHTS_NAME).__contains__))
         config = read_config(path / CONFIG_NAME, cls.__name__)
         try:
             arguments = cls.parse_arguments(config)

@@ -45,6 +45,7 @@ LIMITS = {
     "glb_vertices": Limit(3_000_000, "vertices and triangle corners of a GLB file"),
     "glb_ellipsoids": Limit(20_000, "ellipsoids that must be fitted to vertices of a GLB file"),
     "array_bytes": Limit(2**28, "bytes of an array or of a batch of pictures in an .npz file, after decompression"),
+    "copied_bytes": Limit(2**35, "bytes of a file that is copied from object storage to this machine"),
     "model_parameters": Limit(2_000_000_000, "parameters of a network"),
     "model_buffers": Limit(2**24, "entries of the buffers of a network, such as position embeddings"),
     "model_timesteps": Limit(100_000, "training timesteps of a noise schedule"),

@@ -139,11 +139,11 @@ class PrITTIPipeline:
 
     @classmethod
     def from_pretrained(cls, directory: str | os.PathLike, torch_dtype: torch.dtype | None = None) -> PrITTIPipeline:
-        """Load a pipeline from a local directory, or load included weights by name. Nothing is downloaded.
+        """Load a pipeline from a directory, or load included weights by name. Model hubs are not asked.
 
         Args:
-            directory: Directory written by `save_pretrained` or jobs/train_dit.py, or a name such as "town"
-                (models/pretrained.py).
+            directory: Directory written by `save_pretrained` or jobs/train_dit.py, as a path or as a URI such as
+                s3://bucket/folder; or a name such as "town" (models/pretrained.py).
             torch_dtype: Data type of the parameters; None: the stored data type.
 
         Returns:

@@ -6,6 +6,9 @@ import hashlib
 import os
 from pathlib import Path
 
+from models.local_copy import make_local_copy
+from models.uris import is_uri
+
 WEIGHTS = Path(__file__).parent / "weights"
 INDEX_NAME = "model_index.json"  # Every pipeline directory contains this file.
 CHECKSUMS_NAME = "checksums.json"
@@ -18,10 +21,11 @@ def list_released() -> list[str]:
 
 
 def find_pipeline_path(model: str | os.PathLike) -> str:
-    """Find the local directory of a pipeline; nothing is downloaded.
+    """Find the local directory of a pipeline. Model hubs are not asked.
 
     Args:
-        model: Path of a pipeline directory or name of included weights. If both exist, the path is used.
+        model: Path of a pipeline directory, URI of a pipeline directory, or name of included weights. If both a path
+            and a name exist, the path is used. A URI is copied to the local cache (models/local_copy.py).
 
     Returns:
         Path of the directory.
@@ -30,6 +34,11 @@ def find_pipeline_path(model: str | os.PathLike) -> str:
         ValueError: `model` is neither an existing directory nor the name of included weights.
     """
     model = os.fspath(model)
+    if is_uri(model):
+        copy = make_local_copy(model, is_pipeline_file)
+        if not os.path.exists(os.path.join(copy, INDEX_NAME)):
+            raise ValueError(f"{model}: no PrITTI pipeline here; {INDEX_NAME} is missing")
+        return copy
     if os.path.exists(os.path.join(model, INDEX_NAME)):
         return model
     if model in list_released():
@@ -37,6 +46,18 @@ def find_pipeline_path(model: str | os.PathLike) -> str:
     raise ValueError(
         f"{model}: no PrITTI pipeline here, and no included weights have this name ({', '.join(list_released())})"
     )
+
+
+def is_pipeline_file(name: str) -> bool:
+    """Return whether a pipeline loads a file.
+
+    Args:
+        name: Path of the file relative to the pipeline directory.
+
+    Returns:
+        Whether the file belongs to a pipeline.
+    """
+    return name == INDEX_NAME or (name.count("/") == 1 and name.endswith((".safetensors", ".json")))
 
 
 def compute_checksums(directory: str | os.PathLike) -> dict[str, str]:

@@ -121,17 +121,20 @@ def real_data() -> Path:
 @pytest.fixture(scope="session")
 def cluster(tmp_path_factory):
     """One small local Ray cluster for all tests, with an empty $PRITTI_HOME."""
+    from s3_server import KEYS
+
     from jobs.support.cli import RAY_ENVIRONMENT
 
     settings = {
         "PRITTI_HOME": str(tmp_path_factory.mktemp("nobody")),
+        "PRITTI_CACHE": str(tmp_path_factory.mktemp("cache")),
         "RAY_AUTH_MODE": "disabled",
         "RAY_DATA_USE_DATASOURCE_V2": "0",
         "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.2",
         "RAY_worker_niceness": "0",  # workers need CPU time while another process runs tests
         "DO_NOT_TRACK": "true",
     }
-    os.environ.update(RAY_ENVIRONMENT | settings)
+    os.environ.update(RAY_ENVIRONMENT | settings | KEYS)
     os.environ.pop("MLFLOW_TRACKING_URI", None)
     import logging
 

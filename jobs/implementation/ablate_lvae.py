@@ -20,7 +20,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from jobs.ablate_lvae import Augmentation, Branches, Decoders, Encoding, Ground
 from jobs.implementation.train_lvae import prepare
 from jobs.support.cli import resolve_path
-from jobs.support.ray_session import start_ray
+from jobs.support.outputs import hold_output
 from jobs.support.terminal import print_table
 from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun, fit
@@ -43,7 +43,7 @@ from pipelines.training.latents import load_lvae
 
 TIMING_STEPS = 60
 # Options that may change between runs of a study.
-NOT_RECORDED = ("num_seeds", "only_variants", "num_workers", "output")
+NOT_RECORDED = ("num_seeds", "only_variants", "num_workers", "output", "if_busy")
 RECORDED_AS = {"max_scenes": "limit", "num_checkpoints": "checks"}  # keys in study.json
 
 
@@ -56,33 +56,33 @@ def compare_encodings(config: Encoding) -> str:
     settings = StudyConfig(config.epochs, config.batch_size, config.learning_rate)
     trials = plan_trials(config)
     guard_study(output, asdict(settings) | {"test": config.num_test_boxes})
-    start_ray()
-    tracker = Tracker.start("pritti-ablation", "encoding", asdict(config), storage.join_uri(output, "mlflow.json"))
-    with Progress() as bar:
-        shown = bar.add_task("train autoencoders", total=len(trials))
-        scores = ablation.reconstruct_boxes(
-            trials,
-            storage.join_uri(output, "trials"),
-            settings,
-            config.num_test_boxes,
-            config.max_concurrent_trials,
-            lambda: bar.advance(shown),
-        )
-        bar.add_task("measure yaw errors", total=None)
-        losses = ablation.compute_yaw_losses(config.num_noisy_boxes)
-    rows = ablation.average_by_size(scores)
-    for row in rows:
-        name = f"{row['boxes']}.{row['numbers']}.{row['encoding']}.iou3d"
-        tracker.metrics({name: row["iou3d_mean"]}, row["training_size"])
-    notes = [
-        f"{config.num_seeds} seeds, {config.epochs} epochs, batches of {config.batch_size}, learning rate "
-        f"{config.learning_rate:g}, {config.num_test_boxes} test boxes, at most "
-        f"{max(r['parameters'] for r in scores):,} parameters; the networks of all encodings differ only in "
-        "their first and last layer.",
-        describe_machine(),
-    ]
-    write_encoding_report(config, output, rows, losses, notes, tracker)
-    return output
+    with hold_output(output, "ablation", config.if_busy):
+        tracker = Tracker.start("pritti-ablation", "encoding", asdict(config), storage.join_uri(output, "mlflow.json"))
+        with Progress() as bar:
+            shown = bar.add_task("train autoencoders", total=len(trials))
+            scores = ablation.reconstruct_boxes(
+                trials,
+                storage.join_uri(output, "trials"),
+                settings,
+                config.num_test_boxes,
+                config.max_concurrent_trials,
+                lambda: bar.advance(shown),
+            )
+            bar.add_task("measure yaw errors", total=None)
+            losses = ablation.compute_yaw_losses(config.num_noisy_boxes)
+        rows = ablation.average_by_size(scores)
+        for row in rows:
+            name = f"{row['boxes']}.{row['numbers']}.{row['encoding']}.iou3d"
+            tracker.metrics({name: row["iou3d_mean"]}, row["training_size"])
+        notes = [
+            f"{config.num_seeds} seeds, {config.epochs} epochs, batches of {config.batch_size}, learning rate "
+            f"{config.learning_rate:g}, {config.num_test_boxes} test boxes, at most "
+            f"{max(r['parameters'] for r in scores):,} parameters; the networks of all encodings differ only in "
+            "their first and last layer.",
+            describe_machine(),
+        ]
+        write_encoding_report(config, output, rows, losses, notes, tracker)
+        return output
 
 
 def plan_trials(config: Encoding) -> list:
@@ -130,25 +130,26 @@ def compare_variants(config: Branches) -> str:
     find_preset(LVAE_PRESETS, config.preset)
     chosen = select_variants(config)
     guard_study(output, {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED})
-    start_ray()
-    tracker = Tracker.start("pritti-ablation", config.name, asdict(config), storage.join_uri(output, "mlflow.json"))
-    scores = []
-    for seed in range(config.num_seeds):
-        for variant in chosen:
-            path = storage.join_uri(output, "runs", f"{make_slug(variant)}-seed{seed}.json")
-            if not storage.exists(path):
-                storage.write_json(train_variant(config, variant, seed, output), path)
-            scores.append(storage.read_json(path))
-            kept = {f"{make_slug(variant)}.{name}": scores[-1][name] for name in ablation.MEASURES}
-            tracker.metrics({name: value for name, value in kept.items() if value is not None}, seed)
-    rows, curves = ablation.group_by_variant(scores), ablation.draw_curve_chart(scores)
-    table = ablation.build_variant_table(rows)
-    write_tables(output, config.name, rows, [table], curves)
-    equal = "the same training time" if is_at_equal_time(config) and not config.steps else "the same number of steps"
-    how = [f"Preset {config.preset}, dataset {scores[0]['dataset']}, {equal} for all variants.", describe_machine()]
-    html = ablation.render_page("Ablations of the layout VAE", config.name, [table], [curves], how)
-    write_page(output, html, [table], tracker)
-    return output
+    with hold_output(output, "ablation", config.if_busy):
+        tracker = Tracker.start("pritti-ablation", config.name, asdict(config), storage.join_uri(output, "mlflow.json"))
+        scores = []
+        for seed in range(config.num_seeds):
+            for variant in chosen:
+                path = storage.join_uri(output, "runs", f"{make_slug(variant)}-seed{seed}.json")
+                if not storage.exists(path):
+                    storage.write_json(train_variant(config, variant, seed, output), path)
+                scores.append(storage.read_json(path))
+                kept = {f"{make_slug(variant)}.{name}": scores[-1][name] for name in ablation.MEASURES}
+                tracker.metrics({name: value for name, value in kept.items() if value is not None}, seed)
+        rows, curves = ablation.group_by_variant(scores), ablation.draw_curve_chart(scores)
+        table = ablation.build_variant_table(rows)
+        write_tables(output, config.name, rows, [table], curves)
+        is_timed = is_at_equal_time(config) and not config.steps
+        equal = "the same training time" if is_timed else "the same number of steps"
+        how = [f"Preset {config.preset}, dataset {scores[0]['dataset']}, {equal} for all variants.", describe_machine()]
+        html = ablation.render_page("Ablations of the layout VAE", config.name, [table], [curves], how)
+        write_page(output, html, [table], tracker)
+        return output
 
 
 def select_variants(config: Branches) -> dict[str, Variant]:

@@ -6,8 +6,6 @@ for an invalid option. The implementations also call these functions.
 
 from __future__ import annotations
 
-import os
-
 from jobs.encode_latents import Config as EncodeConfig
 from jobs.evaluate_scenes import Config as EvaluateConfig
 from jobs.implementation.protocols import apply_protocol
@@ -102,7 +100,7 @@ def check_encode_latents(config: EncodeConfig) -> None:
 
 
 def check_preprocess_scenes(config: Town | Kitti360 | Av2 | Own) -> None:
-    if not isinstance(config, Town) and "://" not in config.input and not os.path.isdir(make_absolute(config.input)):
+    if not isinstance(config, Town) and not storage.exists(make_absolute(config.input)):
         raise ValueError(f"--input {config.input}: no such directory; specify the root directory of the dataset")
 
 

@@ -6,7 +6,7 @@ from rich.progress import Progress
 
 from jobs.encode_latents import Config
 from jobs.support.cli import make_absolute, resolve_path
-from jobs.support.ray_session import start_ray
+from jobs.support.outputs import hold_output
 from pipelines.schema.dataset import Dataset
 from pipelines.training.latents import encode_latents
 
@@ -16,8 +16,7 @@ def encode(config: Config) -> dict:
     dataset = Dataset.open(resolve_path(config.dataset, "datasets", "town"))
     lvae = resolve_path(config.lvae, "models", "lvae-town")
     output = make_absolute(config.output) if config.output else dataset.root
-    start_ray()
-    with Progress() as bar:
+    with hold_output(output, "latents", config.if_busy), Progress() as bar:
         shown = bar.add_task("encode latents", total=sum(dataset.scenes.values()))
         return encode_latents(
             dataset,

@@ -14,11 +14,12 @@ from jobs.implementation.checks import check_evaluate_scenes
 from jobs.implementation.protocols import PROTOCOLS, apply_protocol
 from jobs.support.cli import home_path, make_absolute, resolve_path
 from jobs.support.lite0 import prepare_lite0
-from jobs.support.ray_session import start_ray
+from jobs.support.outputs import hold_output
 from jobs.support.scores import publish_scores
 from jobs.support.value_names import REFERENCES
 from models.pretrained import INDEX_NAME
 from models.tensors import EXISTENCE_THRESHOLD
+from models.uris import split_name
 from pipelines.evaluation.evaluate import (
     compare_datasets,
     convert_estimates,
@@ -67,24 +68,24 @@ def evaluate(config: Config) -> dict:
     output = resolve_path(config.output, "evaluations", config.run or "latest")
     scores: dict = {}
     sides = select_sides(config, dataset) if wanted else {}
-    start_ray()
-    with Progress() as bar:
-        if config.lvae and dataset is not None:
-            scores["reconstruction"] = score_reconstruction(config, dataset, output, bar)
-        if wanted:
-            is_streamed = bool(config.protocol) and PROTOCOLS[config.protocol].is_streamed
-            evaluate_sides = evaluate_streamed if is_streamed else evaluate_generation
-            scores["generation"] = evaluate_sides(config, dataset, sides, output, bar)
-    storage.write_json(describe_inputs(config, dataset, sides), storage.join_uri(output, "evaluation.json"))
-    tags = {
-        "real": config.real or home_path("datasets", "town"),
-        "split": config.real_split,
-        "protocol": config.protocol,
-        "generated": wanted,
-        "lvae": config.lvae and make_absolute(config.lvae),
-    }
-    pages = {"reconstruction": "reconstruction.html", "generation": "evaluation.html"}
-    return publish_scores(output, scores, tags, [pages[name] for name in scores])
+    with hold_output(output, "evaluation", config.if_busy):
+        with Progress() as bar:
+            if config.lvae and dataset is not None:
+                scores["reconstruction"] = score_reconstruction(config, dataset, output, bar)
+            if wanted:
+                is_streamed = bool(config.protocol) and PROTOCOLS[config.protocol].is_streamed
+                evaluate_sides = evaluate_streamed if is_streamed else evaluate_generation
+                scores["generation"] = evaluate_sides(config, dataset, sides, output, bar)
+        storage.write_json(describe_inputs(config, dataset, sides), storage.join_uri(output, "evaluation.json"))
+        tags = {
+            "real": config.real or home_path("datasets", "town"),
+            "split": config.real_split,
+            "protocol": config.protocol,
+            "generated": wanted,
+            "lvae": config.lvae and make_absolute(config.lvae),
+        }
+        pages = {"reconstruction": "reconstruction.html", "generation": "evaluation.html"}
+        return publish_scores(output, scores, tags, [pages[name] for name in scores])
 
 
 def describe_inputs(config: Config, dataset: Dataset | None, sides: dict[str, SceneSet]) -> dict:
@@ -215,7 +216,7 @@ def describe_peers(config: Config, dataset: Dataset | None, output: str, bar: Pr
         return {}
     found = {}
     for path in map(make_absolute, config.peers):
-        side, name = SceneSubset(path), path.rstrip("/").rsplit("/", 1)[-1]
+        side, name = SceneSubset(path), split_name(path)[1]
         side = replace(side, limit=sum(len(rows) for _, rows in side.shards()))
         task = bar.add_task(f"describe {name}", total=side.limit)
         found[name] = compute_scene_features(
@@ -373,7 +374,7 @@ def read_existence_threshold(lvae: str) -> float:
     Returns:
         Threshold of the pipeline. If there is no pipeline, or if it stores none: the paper's threshold.
     """
-    index = storage.join_uri(lvae.rstrip("/").rpartition("/")[0], INDEX_NAME)
+    index = storage.join_uri(split_name(lvae)[0], INDEX_NAME)
     stored = storage.read_json(index) if storage.exists(index) else {}
     return stored.get("existence_threshold", EXISTENCE_THRESHOLD)
 

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from jobs.evaluate_seams import Config
 from jobs.support.cli import resolve_path
-from jobs.support.ray_session import start_ray
+from jobs.support.outputs import hold_output
 from jobs.support.scores import publish_scores
 from pipelines.evaluation.evaluate import convert_estimates
 from pipelines.evaluation.seams import (
@@ -53,21 +53,23 @@ def evaluate_seams(config: Config) -> dict:
     }
     for selection, _ in sides.values():
         selection.shards()  # raise an error for missing scenes before Ray starts
-    start_ray()
-    with Progress() as bar:
-        measured = {}
-        for name, (selection, lines) in sides.items():
-            task = bar.add_task(f"measure {name}", total=sum(len(rows) for _, rows in selection.shards()))
-            measured[name] = measure_seams(selection, lines, config.num_actors, lambda task=task: bar.advance(task))
-        real, lines = sides["real"]
-        task = bar.add_task("measure unrelated halves", total=len(measured["real"].scene_ids))
-        measured["joined"] = measure_seams(real, lines, config.num_actors, lambda: bar.advance(task), is_joined=True)
-    scores = join_scene_sets(measured)
-    storage.write_parquet(build_seams_table(measured), storage.join_uri(output, "seams.parquet"))
-    html = render_seams_html(convert_estimates(scores), *sides["generated"], SHOWN)
-    storage.write_text(html, storage.join_uri(output, "seams.html"))
-    tags = {name: selection.root for name, (selection, _) in sides.items()}
-    return publish_scores(output, scores, tags, ["seams.html"])
+    with hold_output(output, "evaluation", config.if_busy):
+        with Progress() as bar:
+            measured = {}
+            for name, (selection, lines) in sides.items():
+                task = bar.add_task(f"measure {name}", total=sum(len(rows) for _, rows in selection.shards()))
+                measured[name] = measure_seams(selection, lines, config.num_actors, lambda task=task: bar.advance(task))
+            real, lines = sides["real"]
+            task = bar.add_task("measure unrelated halves", total=len(measured["real"].scene_ids))
+            measured["joined"] = measure_seams(
+                real, lines, config.num_actors, lambda: bar.advance(task), is_joined=True
+            )
+        scores = join_scene_sets(measured)
+        storage.write_parquet(build_seams_table(measured), storage.join_uri(output, "seams.parquet"))
+        html = render_seams_html(convert_estimates(scores), *sides["generated"], SHOWN)
+        storage.write_text(html, storage.join_uri(output, "seams.html"))
+        tags = {name: selection.root for name, (selection, _) in sides.items()}
+        return publish_scores(output, scores, tags, ["seams.html"])
 
 
 def main(config: Config) -> None:

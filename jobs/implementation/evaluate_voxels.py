@@ -8,7 +8,7 @@ from rich.table import Table
 
 from jobs.evaluate_voxels import Config
 from jobs.support.cli import make_absolute, resolve_path
-from jobs.support.ray_session import start_ray
+from jobs.support.outputs import hold_output
 from jobs.support.scores import publish_scores
 from pipelines.evaluation.voxel_reconstruction import group_files_by_scene, list_true_scenes, pair_files, score_voxels
 from pipelines.geometry.voxels import VoxelGrid
@@ -27,19 +27,19 @@ def evaluate(config: Config) -> dict:
     rebuilt = group_files_by_scene(make_absolute(config.reconstructed), ".npz")
     stored = group_files_by_scene(make_absolute(config.compressed)) if config.compressed else None
     pairs = pair_files(truth, rebuilt, stored, config.allow_missing)
-    start_ray()
-    with Progress() as bar:
-        shown = bar.add_task("score voxels", total=len(pairs))
-        scores, scenes = score_voxels(pairs, grid, axes, truth_axes, lambda: bar.advance(shown))
-    scores["left_out"] = {"truths": len(truth) - len(pairs), "reconstructions": len(rebuilt) - len(pairs)}
     output = resolve_path(config.output, "evaluations", "voxels")
-    storage.write_parquet(scenes, storage.join_uri(output, "voxels.parquet"))
-    tags = {
-        "truth": make_absolute(config.ground_truth),
-        "split": config.split,
-        "rebuilt": make_absolute(config.reconstructed),
-    }
-    return publish_scores(output, scores, tags)
+    with hold_output(output, "evaluation", config.if_busy):
+        with Progress() as bar:
+            shown = bar.add_task("score voxels", total=len(pairs))
+            scores, scenes = score_voxels(pairs, grid, axes, truth_axes, lambda: bar.advance(shown))
+        scores["left_out"] = {"truths": len(truth) - len(pairs), "reconstructions": len(rebuilt) - len(pairs)}
+        storage.write_parquet(scenes, storage.join_uri(output, "voxels.parquet"))
+        tags = {
+            "truth": make_absolute(config.ground_truth),
+            "split": config.split,
+            "rebuilt": make_absolute(config.reconstructed),
+        }
+        return publish_scores(output, scores, tags)
 
 
 def main(config: Config) -> None:

@@ -10,6 +10,7 @@ from rich.progress import Progress
 from jobs.inspect_scenes import DatasetOptions, Gallery, OneScene, Report, Sheet
 from jobs.support.cli import home_path, make_absolute, require_positive, resolve_path
 from jobs.support.ray_session import start_ray
+from models.uris import split_name
 from pipelines.io.mesh_export import export_glb
 from pipelines.rendering.render import encode_png
 from pipelines.reporting.contact_sheet import (
@@ -37,7 +38,7 @@ def make_output_path(config: OneScene | Sheet | Report | Gallery, name: str) -> 
     """Return the value of --output, or a path under $PRITTI_HOME that contains the name of the dataset."""
     if config.output:
         return make_absolute(config.output)
-    return home_path("inspect", find_dataset_directory(config).rstrip("/").rsplit("/", 1)[-1], name).rstrip("/")
+    return home_path("inspect", split_name(find_dataset_directory(config))[1], name).rstrip("/")
 
 
 def read_catalogue(config: OneScene | Sheet | Gallery) -> Catalogue:

@@ -10,7 +10,7 @@ from rich.progress import MofNCompleteColumn, Progress
 from jobs.implementation.checks import check_outpaint_scenes
 from jobs.outpaint_scenes import Config
 from jobs.support.model_directories import find_pipeline_directory
-from jobs.support.ray_session import start_ray
+from jobs.support.outputs import hold_output
 from jobs.support.scene_requests import make_repaint_config, select_scenes
 from pipelines.generation.outpaint import HARDLY_KNOWN, OutpaintRequest, outpaint_scenes
 
@@ -62,11 +62,11 @@ def outpaint(config: Config) -> pa.Table:
         order=config.order,
         batch_size=config.batch_size,
     )
-    start_ray()
-    ahead, behind, left, right = counts
-    with Progress(*Progress.get_default_columns(), MofNCompleteColumn()) as bar:
-        shown = bar.add_task("outpaint, blocks", total=count * ((ahead + behind + 1) * (left + right + 1) - 1))
-        return outpaint_scenes(request, selection, config.num_actors, lambda blocks: bar.advance(shown, blocks))
+    with hold_output(request.output, request.source, config.if_busy):
+        ahead, behind, left, right = counts
+        with Progress(*Progress.get_default_columns(), MofNCompleteColumn()) as bar:
+            shown = bar.add_task("outpaint, blocks", total=count * ((ahead + behind + 1) * (left + right + 1) - 1))
+            return outpaint_scenes(request, selection, config.num_actors, lambda blocks: bar.advance(shown, blocks))
 
 
 def main(config: Config) -> None:

@@ -9,13 +9,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from jobs.implementation.checks import check_preprocess_scenes
 from jobs.preprocess_scenes import Av2, Kitti360, Own, Town
 from jobs.support.cli import make_absolute, resolve_path
-from jobs.support.ray_session import start_ray
+from jobs.support.outputs import hold_output
 from models.layout import PAPER_SLOTS
 from pipelines.preprocess import sharding
 from pipelines.preprocess.ingest import ingest_drives
 from pipelines.preprocess.sources.town.generator import TOWN_VERSION
 
-NOT_RECORDED = ("output", "skip_unreadable")
+NOT_RECORDED = ("output", "skip_unreadable", "if_busy")
 RECORDED_AS = {"make_split": "split"}  # keys in dataset.json
 
 
@@ -46,7 +46,6 @@ def main(config: Town | Kitti360 | Av2 | Own) -> None:
     output = resolve_path(config.output, "datasets", source)
     skip = getattr(config, "skip_unreadable", False)
     slots = PAPER_SLOTS if options.get("slots") == "paper" else None
-    start_ray()
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -54,7 +53,7 @@ def main(config: Town | Kitti360 | Av2 | Own) -> None:
         TextColumn("shards"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns) as bar:
+    with hold_output(output, "dataset", config.if_busy), Progress(*columns) as bar:
         shown = bar.add_task(f"preprocess {source}", total=len(shards))
         result = ingest_drives(
             shards, output, options, slots, skip_unreadable=skip, on_shard=lambda _: bar.advance(shown)

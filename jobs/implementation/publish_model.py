@@ -13,6 +13,7 @@ import torch
 from jobs.publish_model import Config
 from jobs.support.cli import home_path, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
+from jobs.support.outputs import hold_lease
 from jobs.support.registry import EXPERIMENT, PIPELINE, register_version
 from jobs.support.tracking import Tracker, find_tracking_uri, hide_credentials, make_client
 from jobs.support.trainer import publish_directory
@@ -20,6 +21,7 @@ from models.labels import LABELS
 from models.pipeline import PrITTIPipeline
 from models.pretrained import CHECKSUMS_NAME, TRAINING_NAME, WEIGHTS, compute_checksums
 from models.tensors import EXISTENCE_THRESHOLD
+from models.uris import split_name
 from pipelines.generation.sample import load_pipeline
 from pipelines.metrics.validity import compute_scene_validity, find_slab_offset_m
 from pipelines.rendering.render import arrange_contact_sheet, encode_png, render_bev
@@ -61,7 +63,7 @@ def publish(config: Config) -> list[str]:
     trainings = [training for stage in stages for training in stage]
     output = resolve_path(config.output, "zoo", config.name)
     entry = {"trainings": trainings, "facts": facts, "scores": scores, "about": about}
-    with tempfile.TemporaryDirectory() as staging:
+    with hold_lease(*split_name(output), config.if_busy), tempfile.TemporaryDirectory() as staging:
         version = write_entry(staging, config.name, pipeline, "-".join(weights), **entry)
         publish_directory(staging, output)
         if not config.register:

@@ -6,7 +6,7 @@ from rich.progress import Progress
 
 from jobs.render_streets import Config
 from jobs.support.cli import make_absolute, resolve_path
-from jobs.support.ray_session import start_ray
+from jobs.support.outputs import hold_output
 from jobs.support.scene_requests import select_scenes
 from pipelines.rendering.pinhole import Lens
 from pipelines.rendering.street_views import StreetRequest, render_streets
@@ -36,8 +36,7 @@ def render(config: Config) -> dict[str, int]:
         right=config.lateral_offset,
         most=config.max_frames,
     )
-    start_ray()
-    with Progress() as bar:
+    with hold_output(request.output, f"streets-{config.run}", config.if_busy), Progress() as bar:
         shown = bar.add_task("render streets", total=total)
         return render_streets(request, selection, lambda: bar.advance(shown))
 

@@ -8,7 +8,7 @@ from jobs.implementation.checks import check_sample_scenes
 from jobs.sample_scenes import Config
 from jobs.support.cli import resolve_path
 from jobs.support.model_directories import find_pipeline_directory, read_label_kind
-from jobs.support.ray_session import start_ray
+from jobs.support.outputs import hold_output
 from models.labels import LABELS
 from pipelines.generation.sample import SampleRequest, sample_scenes
 from pipelines.io.mesh_export import export_glb
@@ -37,15 +37,15 @@ def sample(config: Config) -> str:
         repair=config.repair,
         shard_scenes=min(64, max(1, -(-config.num_scenes // 8))),
     )
-    start_ray()
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TaskProgressColumn(show_speed=True))
-    with Progress(*columns) as bar:
-        shown = bar.add_task("sample scenes", total=config.num_scenes)
-        sample_scenes(request, config.num_actors, config.batch_size, lambda row: bar.advance(shown, row["scenes"]))
-    for scene in read_scenes(output, f"generated-{config.run}", limit=config.num_glb) if config.num_glb else ():
-        path = storage.join_uri(output, "glb", config.run, f"{make_file_name(scene.scene_id)}.glb")
-        storage.write_whole(path, lambda stream, scene=scene: stream.write(export_glb(scene)))
-    return output
+    with hold_output(output, request.source, config.if_busy):
+        columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TaskProgressColumn(show_speed=True))
+        with Progress(*columns) as bar:
+            shown = bar.add_task("sample scenes", total=config.num_scenes)
+            sample_scenes(request, config.num_actors, config.batch_size, lambda row: bar.advance(shown, row["scenes"]))
+        for scene in read_scenes(output, f"generated-{config.run}", limit=config.num_glb) if config.num_glb else ():
+            path = storage.join_uri(output, "glb", config.run, f"{make_file_name(scene.scene_id)}.glb")
+            storage.write_whole(path, lambda stream, scene=scene: stream.write(export_glb(scene)))
+        return output
 
 
 def main(config: Config) -> None:

@@ -11,7 +11,7 @@ from rich.progress import Progress
 from jobs.support.cli import require_positive, resolve_path
 from jobs.support.lite0 import prepare_lite0
 from jobs.support.model_directories import find_pipeline_directory, read_label_kind
-from jobs.support.ray_session import start_ray
+from jobs.support.outputs import hold_output
 from jobs.support.terminal import print_table
 from jobs.sweep_samplers import Config
 from models.labels import LABELS
@@ -71,54 +71,54 @@ def sweep_samplers(config: Config) -> list[dict]:
     others = replace(others, limit=count)
     labels = LABELS[read_label_kind(model)]
     rows, pictures = [], []
-    start_ray()
-    with Progress() as bar:
-        looks = FeatureConfig(lite0=prepare_lite0())
+    with hold_output(output, "evaluation", config.if_busy):
+        with Progress() as bar:
+            looks = FeatureConfig(lite0=prepare_lite0())
 
-        def described(side: SceneSubset, name: str, control: str = "") -> dict:
-            task = bar.add_task(f"describe {name}", total=count)
-            directory = storage.join_uri(output, "described", name)
-            how = replace(looks, control=control)
-            return compute_scene_features(
-                side, dataset, how, directory, config.num_actors, lambda n: bar.advance(task, n)
-            ).read()
+            def described(side: SceneSubset, name: str, control: str = "") -> dict:
+                task = bar.add_task(f"describe {name}", total=count)
+                directory = storage.join_uri(output, "described", name)
+                how = replace(looks, control=control)
+                return compute_scene_features(
+                    side, dataset, how, directory, config.num_actors, lambda n: bar.advance(task, n)
+                ).read()
 
-        truth = described(real, "real")
-        for sampler, steps, scaling in product(
-            config.samplers, config.num_inference_steps, config.noise_scalings or (None,)
-        ):
-            request = SampleRequest(
-                model=model,
-                output=output,
-                run=f"{sampler}-{steps}" + (f"-{scaling:g}" if scaling else ""),
-                num_scenes=config.num_scenes,
-                labels=labels,
-                seed=config.seed,
-                num_inference_steps=steps,
-                guidance_scale=config.guidance_scale,
-                sampler=sampler,
-                noise_scaling=scaling,
-                # The shard size does not depend on the number of actors, so a resumed run may use a different number.
-                shard_scenes=max(1, config.num_scenes // 8),
-            )
-            seconds_per_scene = sample_and_time(config, request, bar)
-            made = described(SceneSubset(output, request.source, None, count, "spread"), request.run)
-            scores = compare_datasets(truth, made, dataset.spec.ground_classes)
-            used = storage.read_json(storage.join_uri(output, f"{request.source}.json"))["noise_scaling"]
-            rows.append(make_sampler_row(sampler, steps, used, seconds_per_scene, scores))
-            scenes = read_scenes(output, request.source, limit=config.num_examples) if config.num_examples else ()
-            pictures += [Picture(f"{request.run}, {s.frame}", render_bev(s, supersample=2)) for s in scenes]
-        for name, control in (("other real scenes (ceiling)", ""), (f"control: {CONTROLS[CONTROL]}", CONTROL)):
-            found = described(others, control or "ceiling", control)
-            scores = compare_datasets(truth, found, dataset.spec.ground_classes)
-            rows.append(make_sampler_row(name, None, None, None, scores))
-    how = [
-        f"Real: {count} scenes of {dataset.root}, split {config.real_split}, selected evenly. Model: {model}.",
-        f"Ceiling and control: {count_scenes(others)} scenes of split {others.split}, selected evenly.",
-        f"Seed {config.seed}, guidance scale {config.guidance_scale:g}, labels in turn: {', '.join(labels)}.",
-    ]
-    write_report(output, rows, pictures, max(1, config.num_examples), how)
-    return rows
+            truth = described(real, "real")
+            for sampler, steps, scaling in product(
+                config.samplers, config.num_inference_steps, config.noise_scalings or (None,)
+            ):
+                request = SampleRequest(
+                    model=model,
+                    output=output,
+                    run=f"{sampler}-{steps}" + (f"-{scaling:g}" if scaling else ""),
+                    num_scenes=config.num_scenes,
+                    labels=labels,
+                    seed=config.seed,
+                    num_inference_steps=steps,
+                    guidance_scale=config.guidance_scale,
+                    sampler=sampler,
+                    noise_scaling=scaling,
+                    # The shard size does not depend on the number of actors, so this number may change on resumption.
+                    shard_scenes=max(1, config.num_scenes // 8),
+                )
+                seconds_per_scene = sample_and_time(config, request, bar)
+                made = described(SceneSubset(output, request.source, None, count, "spread"), request.run)
+                scores = compare_datasets(truth, made, dataset.spec.ground_classes)
+                used = storage.read_json(storage.join_uri(output, f"{request.source}.json"))["noise_scaling"]
+                rows.append(make_sampler_row(sampler, steps, used, seconds_per_scene, scores))
+                scenes = read_scenes(output, request.source, limit=config.num_examples) if config.num_examples else ()
+                pictures += [Picture(f"{request.run}, {s.frame}", render_bev(s, supersample=2)) for s in scenes]
+            for name, control in (("other real scenes (ceiling)", ""), (f"control: {CONTROLS[CONTROL]}", CONTROL)):
+                found = described(others, control or "ceiling", control)
+                scores = compare_datasets(truth, found, dataset.spec.ground_classes)
+                rows.append(make_sampler_row(name, None, None, None, scores))
+        how = [
+            f"Real: {count} scenes of {dataset.root}, split {config.real_split}, selected evenly. Model: {model}.",
+            f"Ceiling and control: {count_scenes(others)} scenes of split {others.split}, selected evenly.",
+            f"Seed {config.seed}, guidance scale {config.guidance_scale:g}, labels in turn: {', '.join(labels)}.",
+        ]
+        write_report(output, rows, pictures, max(1, config.num_examples), how)
+        return rows
 
 
 def sample_and_time(config: Config, request: SampleRequest, bar: Progress) -> float | None:

@@ -9,7 +9,7 @@ from rich.progress import Progress
 
 from jobs.support.cli import require_positive, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
-from jobs.support.ray_session import start_ray
+from jobs.support.outputs import hold_output
 from jobs.support.scene_requests import select_scenes
 from jobs.support.terminal import print_table
 from jobs.sweep_seams import Config
@@ -46,41 +46,47 @@ def sweep_seams(config: Config) -> list[dict]:
     real = SceneSubset(resolve_path(config.real, "datasets", "town"), None, config.real_split, config.max_real_scenes)
     real.shards()  # raise an error for missing scenes before hours of outpainting
     rows, pictures = [], []
-    start_ray()
-    with Progress() as bar:
-        for mode, setting in product(config.neighbour_latents, config.settings):
-            name = "-".join(f"{value:g}" for value in setting) + ("" if mode == "reencode" else f"-{mode}")
-            request = OutpaintRequest(
-                model=model,
-                output=output,
-                run=name,
-                label=config.label or None,
-                seed=config.seed,
-                overlap=config.overlap,
-                mode=mode,
-                repaint=RePaintConfig(*setting),
-                guidance_scale=config.guidance_scale,
-                batch_size=config.batch_size,
-            )
-            done = bar.add_task(f"{name}, blocks", total=8 * count)
-            outpaint_scenes(request, selection, config.num_actors, lambda blocks, task=done: bar.advance(task, blocks))
-            measured = measure_seams(SceneSubset(output, request.source), SeamLines(), config.num_actors)
-            objects = count_objects_per_ha(read_scenes(output, request.source))
-            seams = int(measured.seams.sum())
-            rows.append(make_seam_row(mode, request.repaint, seams, objects, estimate_seam_ratios(measured.records)))
-            first = next(read_scenes(output, request.source))
-            pictures.append(Picture(first.scene_id, draw_lines(first, SeamLines()), name))
-        objects = count_objects_per_ha(scene for shard, chosen in real.shards() for scene in shard.scenes(chosen))
-        for key, name in enumerate(("real", "joined")):
-            measured = measure_seams(real, SeamLines(config.real_rows_m), config.num_actors, is_joined=name == "joined")
-            ratios = estimate_seam_ratios(measured.records, key)
-            rows.append(make_seam_row(COLUMNS[name], None, int(measured.seams.sum()), objects, ratios))
-    storage.write_json(rows, storage.join_uri(output, "sweep.json"))
-    storage.write_parquet(pa.Table.from_pylist(rows), storage.join_uri(output, "sweep.parquet"))
-    how = [f"{count} scenes of {selection.root}, overlap {config.overlap:g}. Model: {model}."]
-    html = render_seam_sweep_html(rows, pictures, how)
-    storage.write_text(html, storage.join_uri(output, "sweep.html"))
-    return rows
+    with hold_output(output, "evaluation", config.if_busy):
+        with Progress() as bar:
+            for mode, setting in product(config.neighbour_latents, config.settings):
+                name = "-".join(f"{value:g}" for value in setting) + ("" if mode == "reencode" else f"-{mode}")
+                request = OutpaintRequest(
+                    model=model,
+                    output=output,
+                    run=name,
+                    label=config.label or None,
+                    seed=config.seed,
+                    overlap=config.overlap,
+                    mode=mode,
+                    repaint=RePaintConfig(*setting),
+                    guidance_scale=config.guidance_scale,
+                    batch_size=config.batch_size,
+                )
+                done = bar.add_task(f"{name}, blocks", total=8 * count)
+                outpaint_scenes(
+                    request, selection, config.num_actors, lambda blocks, task=done: bar.advance(task, blocks)
+                )
+                measured = measure_seams(SceneSubset(output, request.source), SeamLines(), config.num_actors)
+                objects = count_objects_per_ha(read_scenes(output, request.source))
+                seams = int(measured.seams.sum())
+                rows.append(
+                    make_seam_row(mode, request.repaint, seams, objects, estimate_seam_ratios(measured.records))
+                )
+                first = next(read_scenes(output, request.source))
+                pictures.append(Picture(first.scene_id, draw_lines(first, SeamLines()), name))
+            objects = count_objects_per_ha(scene for shard, chosen in real.shards() for scene in shard.scenes(chosen))
+            for key, name in enumerate(("real", "joined")):
+                measured = measure_seams(
+                    real, SeamLines(config.real_rows_m), config.num_actors, is_joined=name == "joined"
+                )
+                ratios = estimate_seam_ratios(measured.records, key)
+                rows.append(make_seam_row(COLUMNS[name], None, int(measured.seams.sum()), objects, ratios))
+        storage.write_json(rows, storage.join_uri(output, "sweep.json"))
+        storage.write_parquet(pa.Table.from_pylist(rows), storage.join_uri(output, "sweep.parquet"))
+        how = [f"{count} scenes of {selection.root}, overlap {config.overlap:g}. Model: {model}."]
+        html = render_seam_sweep_html(rows, pictures, how)
+        storage.write_text(html, storage.join_uri(output, "sweep.html"))
+        return rows
 
 
 def main(config: Config) -> None:

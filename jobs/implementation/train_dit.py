@@ -26,7 +26,7 @@ from jobs.support import trainer
 from jobs.support.callbacks import SamplingCheck
 from jobs.support.cli import home_path, make_absolute, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
-from jobs.support.ray_session import start_ray
+from jobs.support.outputs import hold_training
 from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun, publish_directory
 from jobs.support.value_names import RECORDED_PREDICTIONS, RECORDED_TIMESTEPS
@@ -67,7 +67,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     architecture |= start.inherited if start else {}
     settings = make_optimizer_config(config, row)
     identity = make_run_identity(config, row, settings, latents, root, start) | {"label": label_kind}
-    name = config.name or f"dit-{config.preset}"
+    name = find_run_name(config)
     record = trainer.guard_run_name(name, home_path("runs"), identity)
     tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
     execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
@@ -116,7 +116,6 @@ def parse_timestep_sampling(config: Config) -> TimestepSampling:
 
 def make_smoke_latents(root: str) -> None:
     """Encode the smoke dataset with the smoke layout VAE, which is trained if it is missing."""
-    start_ray(training=True)
     lvae = home_path("models", "lvae-smoke")
     if not storage.exists(storage.join_uri(lvae, "config.json")):
         train_lvae(LVAEConfig(preset="smoke"))
@@ -205,10 +204,16 @@ def make_run_identity(
 
 def train(config: Config) -> str:
     """Train and return the pipeline's directory."""
-    training, complete = prepare(config)
     output = resolve_path(config.output, "models", f"pritti-{config.name or config.preset}")
-    trainer.fit(training, config.num_workers, storage.join_uri(output, "dit"))
-    return complete(output)
+    with hold_training(find_run_name(config), output, config.if_busy):
+        training, complete = prepare(config)
+        trainer.fit(training, config.num_workers, storage.join_uri(output, "dit"))
+        return complete(output)
+
+
+def find_run_name(config: Config) -> str:
+    """Return the name of the training run."""
+    return config.name or f"dit-{config.preset}"
 
 
 @dataclass(frozen=True)
@@ -232,7 +237,8 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
     if digest_weights(pipeline.lvae) != lvae_digest:
         raise ValueError(
             f"--start-from {model}: its transformer was trained on latents of another layout VAE; "
-            f"encode latents with that layout VAE first: jobs/encode_latents.py --lvae {directory}/lvae"
+            "encode latents with that layout VAE first: jobs/encode_latents.py --lvae "
+            f"{storage.join_uri(directory, 'lvae')}"
         )
     built = pipeline.dit.config
     for key in ("patch", "depth", "width", "heads", "prediction", "label"):

@@ -18,6 +18,7 @@ from jobs.support import trainer
 from jobs.support.callbacks import ReconstructionCheck
 from jobs.support.cli import home_path, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
+from jobs.support.outputs import hold_training
 from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun, convert_to_tensors, publish_directory
 from jobs.train_lvae import Config
@@ -52,7 +53,7 @@ def prepare(config: Config) -> TrainingRun:
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
     augment = Augmentation(config.flip, *((1.0, np.radians(2.5)) if config.jitter else (0.0, 0.0)), config.seed)
     identity = make_run_identity(config, row, settings, spec, root, augment)
-    name = config.name or f"lvae-{config.preset}"
+    name = find_run_name(config)
     kept = None
     if config.train_object_decoder_of:
         kept = load_kept_weights(config.train_object_decoder_of, row.architecture(), spec)
@@ -141,12 +142,19 @@ def make_run_identity(
 
 def train(config: Config) -> str:
     """Train a model and return its directory; with --train-object-decoder-of, return the directory of the pipeline."""
-    training = prepare(config)
-    output = resolve_path(config.output, "models", training.name)
-    trainer.fit(training, config.num_workers, output)
-    if config.train_object_decoder_of:
-        return write_updated_pipeline(config.train_object_decoder_of, output, training)
-    return output
+    name = find_run_name(config)
+    output = resolve_path(config.output, "models", name)
+    with hold_training(name, output, config.if_busy):
+        training = prepare(config)
+        trainer.fit(training, config.num_workers, output)
+        if config.train_object_decoder_of:
+            return write_updated_pipeline(config.train_object_decoder_of, output, training)
+        return output
+
+
+def find_run_name(config: Config) -> str:
+    """Return the name of the training run."""
+    return config.name or f"lvae-{config.preset}"
 
 
 @dataclass(frozen=True)

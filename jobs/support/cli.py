@@ -52,14 +52,39 @@ def home_path(*parts: str) -> str:
 
     The path is absolute because a submitted Ray job runs in a copy of the working directory.
     """
-    base = os.environ.get("PRITTI_HOME", "~/pritti")
-    base = base.rstrip("/") if "://" in base else os.path.abspath(os.path.expanduser(base))
-    return "/".join([base, *parts])
+    from models.uris import join_uri
+
+    return join_uri(make_absolute(os.environ.get("PRITTI_HOME", "~/pritti")), *parts)
+
+
+# Jobs that log to MLflow.
+TRACKED = frozenset(
+    ["train_lvae", "train_dit", "ablate_lvae", "evaluate_scenes", "evaluate_seams", "evaluate_voxels", "publish_model"]
+)
+
+
+def require_tracking_uri() -> None:
+    """Check that MLflow has a place for its database.
+
+    Raises:
+        ValueError: $PRITTI_HOME is a URI, and $MLFLOW_TRACKING_URI is not set.
+    """
+    from models.uris import is_uri
+
+    home = home_path()
+    if is_uri(home) and not os.environ.get("MLFLOW_TRACKING_URI"):
+        raise ValueError(
+            f"PRITTI_HOME is {home}, but MLFLOW_TRACKING_URI is not set, and MLflow's database cannot be in object"
+            " storage; set MLFLOW_TRACKING_URI to a tracking server such as http://mlflow:5000, or to"
+            " sqlite:////path/mlflow.db"
+        )
 
 
 def make_absolute(path: str) -> str:
     """Return an absolute path or URI, which is valid for workers in other working directories."""
-    return path if "://" in path else os.path.abspath(os.path.expanduser(path))
+    from models.uris import is_uri, resolve_local_path
+
+    return path if is_uri(path) else resolve_local_path(path)
 
 
 def resolve_path(path: str, *default: str) -> str:
@@ -139,11 +164,13 @@ def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) ->
     config = tyro.cli(options.Config, args=words, prog=prog, description=options.__doc__, **default)
     set_ray_environment()
     try:
+        if job in TRACKED:
+            require_tracking_uri()
         if check := import_check(job):
             check(config)
         importlib.import_module(f"jobs.implementation.{job}").main(config)
-    except KeyboardInterrupt:
-        sys.exit("interrupted; run the same command again to resume")
+    except KeyboardInterrupt as error:
+        sys.exit(f"{error or 'interrupted'}; run the same command again to resume")
     except Exception as error:
         cause = find_root_cause(error)
         if isinstance(cause, (ValueError, OSError)):

@@ -9,6 +9,7 @@ from jobs.support.cli import home_path, make_absolute
 from models.labels import LABELS, require_labels
 from models.options import Choice, check_entries
 from models.pretrained import INDEX_NAME, find_pipeline_path
+from models.uris import split_name
 from pipelines.runtime import storage
 
 
@@ -51,7 +52,7 @@ def find_pipeline_directory(model: str) -> str:
         ValueError: There is no such pipeline, or --model is empty and there are several trained pipelines.
     """
     if not model:
-        found = [path.removesuffix(f"/{INDEX_NAME}") for path in storage.list_files(home_path("models"), INDEX_NAME)]
+        found = [split_name(path)[0] for path in storage.list_files(home_path("models"), INDEX_NAME)]
         if (town := home_path("models", "pritti-town")) in found:
             return town
         if len(found) > 1:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -12,6 +12,15 @@ ModelOption = Annotated[
     tyro.conf.arg(
         help="Pipeline: a directory, a name (town is included in the package), models:/NAME/VERSION, or the id of an "
         "MLflow run of jobs/publish_model.py (default: the pipeline trained under $PRITTI_HOME, or town)."
+    ),
+]
+
+
+IfBusyOption = Annotated[
+    Literal["refuse", "wait", "join"],
+    tyro.conf.arg(
+        help="If another job writes the same output: refuse and name that job, wait until it ends and resume its work, "
+        "or join: wait and fail if it fails."
     ),
 ]
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from mlflow.exceptions import MlflowException
 
-from jobs.support.cli import home_path
 from jobs.support.tracking import find_tracking_uri, hide_credentials, make_client
 from models.base import MAX_CONFIG_BYTES
+from models.local_copy import find_cache_directory
 from models.options import show_value
 from models.pretrained import CHECKSUMS_NAME, INDEX_NAME, compute_checksums
 from models.strict_json import parse_json
@@ -43,7 +43,7 @@ def register_version(name: str, run_id: str) -> str:
 
 
 def download_pipeline(reference: str) -> str:
-    """Copy a published pipeline to $PRITTI_HOME/registry if it is not there, and return its directory.
+    """Copy a published pipeline to the local cache if it is not there, and return its directory.
 
     Args:
         reference: models:/NAME/VERSION or the id of a publishing run.
@@ -62,11 +62,12 @@ def download_pipeline(reference: str) -> str:
             raise ValueError(
                 f"{reference}: {show_value(run_id)} is no id of an MLflow run, expected 32 digits 0-9, a-f"
             )
-        directory = os.path.join(home_path("registry"), run_id)
+        registry = find_cache_directory("registry")
+        directory = os.path.join(registry, run_id)
         if os.path.exists(os.path.join(directory, INDEX_NAME)):
             return directory
-        os.makedirs(home_path("registry"), exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=home_path("registry")) as staging:
+        registry.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=registry) as staging:
             whole = api.download_artifacts(run_id, PIPELINE, staging)
             require_plain_files(whole, staging)
             if compute_checksums(whole) != read_checksums(Path(whole, CHECKSUMS_NAME)):

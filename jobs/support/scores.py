@@ -8,6 +8,8 @@ from math import isfinite
 import pyarrow as pa
 
 from jobs.support.tracking import Tracker
+from models.local_copy import make_local_copy
+from models.uris import split_name
 from pipelines.evaluation.evaluate import convert_estimates, flatten_scores
 from pipelines.metrics.intervals import Estimate
 from pipelines.runtime import storage
@@ -42,15 +44,14 @@ def publish_scores(output: str, scores: Mapping, tags: Mapping[str, str], files:
     schema = pa.schema({"metric": pa.string(), "value": pa.float64(), "low": pa.float64(), "high": pa.float64()})
     storage.write_parquet(pa.Table.from_pylist(rows, schema), storage.join_uri(output, "metrics.parquet"))
 
-    run_name = output.rstrip("/").rsplit("/", 1)[-1]
+    run_name = split_name(output)[1]
     tracker = Tracker.start("pritti-evaluation", run_name, {}, storage.join_uri(output, "mlflow.json"))
     for key, value in tags.items():
         tracker.tag(key, value)
     finite = [(name, number) for name, number in known.items() if isfinite(number)]
     for start in range(0, len(finite), METRICS_PER_CALL):
         tracker.metrics(dict(finite[start : start + METRICS_PER_CALL]), step=0)
-    if "://" not in output:  # MLflow accepts only local files
-        for file in ("metrics.json", *files):
-            tracker.client.log_artifact(tracker.run_id, storage.join_uri(output, file))
+    for file in ("metrics.json", *files):
+        tracker.client.log_artifact(tracker.run_id, make_local_copy(storage.join_uri(output, file)))
     tracker.finish("FINISHED")
     return nested

@@ -10,18 +10,36 @@ from pathlib import Path
 
 from PIL import Image
 
-from jobs.support.cli import home_path
+from jobs.support.cli import home_path, require_tracking_uri
+from models.uris import parse_s3_options, split_options
 from pipelines.runtime import provenance, storage
 
 
 def find_tracking_uri() -> str:
-    """Return $MLFLOW_TRACKING_URI, or the URI of an sqlite file under $PRITTI_HOME."""
+    """Return $MLFLOW_TRACKING_URI, or the URI of an sqlite file under $PRITTI_HOME.
+
+    Raises:
+        ValueError: $PRITTI_HOME is a URI, and $MLFLOW_TRACKING_URI is not set.
+    """
+    require_tracking_uri()
     return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{home_path('mlflow.db')}"
 
 
 def hide_credentials(uri: str) -> str:
     """Return a URI without user and password, for use in messages."""
     return re.sub(r"//[^/@]*@", "//", uri)
+
+
+def make_artifact_location() -> str:
+    """Return the directory of artifacts under $PRITTI_HOME.
+
+    MLflow knows no options of URIs. It reads an endpoint from $MLFLOW_S3_ENDPOINT_URL, which this function sets.
+    """
+    base, options = split_options(home_path("mlartifacts"))
+    found = parse_s3_options(options.lstrip("?")) if base.startswith("s3://") else {}
+    if endpoint := found.get("endpoint_override"):
+        os.environ.setdefault("MLFLOW_S3_ENDPOINT_URL", f"{found.get('scheme', 'https')}://{endpoint}")
+    return base
 
 
 def make_client(uri: str):
@@ -76,7 +94,7 @@ class Tracker:
         api = make_client(uri)
         found = api.get_experiment_by_name(experiment)
         if found is None:
-            artifacts = home_path("mlartifacts") if uri.startswith("sqlite:") else None
+            artifacts = make_artifact_location() if uri.startswith("sqlite:") else None
             experiment_id = api.create_experiment(experiment, artifact_location=artifacts)
         else:
             experiment_id = found.experiment_id

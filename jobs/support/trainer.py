@@ -190,6 +190,7 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
     scaling = make_scaling_config(num_workers, run.stream.batch_size)
     threads = max(1, int(ray.cluster_resources()["CPU"]) // num_workers)
     work = partial(train_worker, run, threads)
+    file_system, path = storage.resolve_uri(run.storage_path)
     packed = cloudpickle.dumps(work)  # pyright: ignore[reportPrivateImportUsage]
     trainer = ray.train.torch.TorchTrainer(
         run_packed,
@@ -197,7 +198,8 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
         scaling_config=scaling,
         run_config=RunConfig(
             name=run.name,
-            storage_path=run.storage_path,
+            storage_path=path,
+            storage_filesystem=file_system,
             checkpoint_config=CheckpointConfig(num_to_keep=2),
             failure_config=FailureConfig(max_failures=RETRIES),
         ),
@@ -279,6 +281,9 @@ def publish_directory(directory: str, output: str) -> None:
     Args:
         directory: Local directory.
         output: Target directory or URI.
+
+    Raises:
+        ValueError: A file is not in the output, or has another size there.
     """
     paths = [
         os.path.relpath(os.path.join(top, name), directory) for top, _, names in os.walk(directory) for name in names
@@ -288,6 +293,12 @@ def publish_directory(directory: str, output: str) -> None:
             storage.write_whole(
                 storage.join_uri(output, path), lambda stream, source=source: shutil.copyfileobj(source, stream)
             )
+    faults = {}
+    for path in paths:
+        target, expected = storage.join_uri(output, path), os.path.getsize(os.path.join(directory, path))
+        if not storage.exists(target) or storage.measure_file_bytes(target) != expected:
+            faults[target] = f"{target}: not the file of {expected:,} bytes that was written"
+    storage.raise_faults(faults, len(paths))
 
 
 def override_settings(settings: OptimizerConfig, **changes: Any) -> OptimizerConfig:

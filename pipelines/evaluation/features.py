@@ -342,7 +342,7 @@ def compute_scene_features(
         shards = side.shards()
         counts = [len(rows) for _, rows in shards]
         tables = ("scenes", "primitives", "rasters")
-        files = [storage.fingerprint_file(shard.path(table)) for shard, _ in shards for table in tables]
+        files = storage.fingerprint_files([shard.path(table) for shard, _ in shards for table in tables])
         judged_by = dataset and [asdict(dataset.vegetation), asdict(dataset.vehicle), list(dataset.spec.ground_classes)]
     guard_options(
         storage.join_uri(directory, "described.json"),
@@ -351,7 +351,9 @@ def compute_scene_features(
         discard=lambda: storage.delete_directory(directory),
         describe=str,
     )
-    missing = [number for number in range(len(counts)) if not storage.exists(make_part_path(directory, number))]
+    promised = {make_part_path(directory, number): count for number, count in enumerate(counts)}
+    faulty = storage.find_faulty_files(promised)
+    missing = [number for number, path in enumerate(promised) if path in faulty]
     if on_scenes:
         on_scenes(sum(counts) - sum(counts[number] for number in missing))
 
@@ -370,6 +372,7 @@ def compute_scene_features(
     for row in rows:
         if on_scenes:
             on_scenes(row["scenes"])
+    storage.require_rows(promised)
     return FeatureParts(directory, len(counts))
 
 

@@ -20,7 +20,7 @@ from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_rows
 from pipelines.schema.run_guard import guard_run
 from pipelines.schema.scene_subset import SceneSubset
-from pipelines.schema.tables import EDITS, TABLES, Shard, make_rejects_table
+from pipelines.schema.tables import EDITS, TABLES, Shard, make_rejects_table, require_written
 
 PICTURE_PX = 512
 OUTLINE_M = 0.4  # Margin between changed objects and their outline (m).
@@ -101,16 +101,16 @@ def write_edited(row: dict, request: EditRequest, parts: list[tuple[Shard, list[
     """Edit the scenes of one shard and write its tables.
 
     Args:
-        row: Row with the number of a shard.
+        row: Row with the number of a shard, and whether its edits table and its rejects table exist.
         request: Edits and the location of the edited scenes.
         parts: Input shards, each with its selected rows.
 
     Returns:
-        Row with the numbers of scenes and of rejected scenes.
+        Row with the number of the shard, and the numbers of scenes and of rejected scenes.
     """
     given, rows = parts[row["shard"]]
     shard = request.shard(row["shard"], given)
-    if not storage.exists(shard.path("edits")):
+    if not row["is_written"]:
         scenes, done, rejects = [], [EDITS.empty_table()], []
         for scene in given.scenes(rows):
             try:
@@ -126,8 +126,9 @@ def write_edited(row: dict, request: EditRequest, parts: list[tuple[Shard, list[
             shard.write(scenes)
         # The edits table is written last and marks the shard as complete.
         storage.write_parquet(pa.concat_tables(done), shard.path("edits"))
-    rejected = len(shard.read("rejects", ["reason"])) if storage.exists(shard.path("rejects")) else 0
-    return {"scenes": len(rows), "rejects": rejected}
+        return {"shard": row["shard"], "scenes": len(rows), "rejects": len(rejects)}
+    rejected = len(shard.read("rejects", ["reason"])) if row["has_rejects"] else 0
+    return {"shard": row["shard"], "scenes": len(rows), "rejects": rejected}
 
 
 @dataclass(frozen=True)
@@ -171,7 +172,13 @@ def edit_scenes(
         edit.check()
     parts = selection.shards()
     request.guard(selection)
-    rows = ray.data.from_items([{"shard": k} for k in range(len(parts))], override_num_blocks=len(parts))
+    shards = [request.shard(k, given) for k, (given, _) in enumerate(parts)]
+    there = {path for t in ("edits", "rejects") for path in storage.list_files(storage.join_uri(request.output, t), "")}
+    todo = [
+        {"shard": k, "is_written": shard.path("edits") in there, "has_rejects": shard.path("rejects") in there}
+        for k, shard in enumerate(shards)
+    ]
+    rows = ray.data.from_items(todo, override_num_blocks=len(parts))
     found = []
     for row in map_rows(rows, lambda row: write_edited(row, request, parts)).iter_rows():
         found.append(row)
@@ -179,7 +186,7 @@ def edit_scenes(
             on_shard(row["scenes"])
     rejects = sum(row["rejects"] for row in found)
     scenes = sum(row["scenes"] for row in found) - rejects
-    shards = [request.shard(k, given) for k, (given, _) in enumerate(parts)]
+    require_written({shards[row["shard"]]: n for row in found if (n := row["scenes"] - row["rejects"])})
     if not scenes:
         reason = shards[0].read("rejects")["reason"][0].as_py()
         raise ValueError(f"all {rejects} scenes were rejected; the first: {reason}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
 from pipelines.schema.file_names import make_file_name
 from pipelines.schema.scene_subset import SceneSubset
-from pipelines.schema.tables import Shard
+from pipelines.schema.tables import Shard, find_unwritten, require_written
 
 
 @dataclass(frozen=True)
@@ -229,16 +230,27 @@ class Inpainter:
 
     def __call__(self, row: dict) -> dict:
         request, shard = self.request, self.request.shard(row["id"])
-        record = storage.join_uri(request.output, "drift", request.run, f"{row['id']:07d}.json")
-        if not (shard.is_written() and storage.exists(record)):
-            source, position = self.chosen[row["id"]]
-            made, drifts = inpaint_one(self.pipeline, request, source.scenes([position])[0], row["id"])
-            for scene in made:
-                path = storage.join_uri(request.output, "glb", request.run, f"{make_file_name(scene.scene_id)}.glb")
-                storage.write_whole(path, lambda stream, scene=scene: stream.write(export_glb(scene)))
-            storage.write_json(drifts, record)
-            shard.write(made)
-        return {"id": row["id"], "drift": storage.read_json(record)}
+        source, position = self.chosen[row["id"]]
+        made, drifts = inpaint_one(self.pipeline, request, source.scenes([position])[0], row["id"])
+        for scene in made:
+            path = storage.join_uri(request.output, "glb", request.run, f"{make_file_name(scene.scene_id)}.glb")
+            storage.write_whole(path, lambda stream, scene=scene: stream.write(export_glb(scene)))
+        storage.write_json(drifts, make_drift_path(request, row["id"]))
+        shard.write(made)
+        return {"id": row["id"]}
+
+
+def make_drift_path(request: InpaintRequest, number: int) -> str:
+    """Return the path of the file with the drift of a scene.
+
+    Args:
+        request: Options of inpainting.
+        number: Number of the scene in the run.
+
+    Returns:
+        Path of a JSON file.
+    """
+    return storage.join_uri(request.output, "drift", request.run, f"{number:07d}.json")
 
 
 def inpaint_scenes(
@@ -286,11 +298,15 @@ def inpaint_scenes(
             region = find_regenerated_pixels(pipeline, given, request.where)
             yield InpaintExample(given, region, request.shard(number).scenes())
 
-    drifts = []
-    for row in map_actors(range(len(chosen)), Inpainter, (request, chosen), num_actors):
-        drifts += row["drift"]
+    promised = {request.shard(number): request.variants for number in range(len(chosen))}
+    measured = set(storage.list_files(storage.join_uri(request.output, "drift", request.run), ".json"))
+    unwritten = {shard.number for shard in find_unwritten(promised)}
+    missing = [k for k in range(len(chosen)) if k in unwritten or make_drift_path(request, k) not in measured]
+    for _ in chain(range(len(chosen) - len(missing)), map_actors(missing, Inpainter, (request, chosen), num_actors)):
         if on_scene:
             on_scene()
+    require_written(promised)
+    drifts = [drift for k in range(len(chosen)) for drift in storage.read_json(make_drift_path(request, k))]
     scores = compute_drift_scores(drifts)
     storage.write_text(
         render_inpaint_html(request.run, request.contents, request.variants, list_examples(), scores),

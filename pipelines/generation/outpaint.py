@@ -37,7 +37,7 @@ from pipelines.io.mesh_export import export_glb
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import count_gpus_per_actor
 from pipelines.schema.scene_subset import SceneSubset
-from pipelines.schema.tables import Shard
+from pipelines.schema.tables import Shard, find_unwritten, require_written
 
 RANKS = {"outward": rank_outward, "colours": rank_four_colors}
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")
@@ -341,12 +341,12 @@ def outpaint_scenes(
     parts = [storage.join_uri(request.output, "blocks", request.run)]
     guard_generation_run(request, pipeline, parts, input=asdict(selection), scenes=selection.files())
 
+    promised = {request.shard(number): 1 for number in range(len(chosen))}
+    files = set(storage.list_files(parts[0], ".safetensors"))
     waiting, done = [], {}
-    for number in range(len(chosen)):
-        if request.shard(number).is_written():
-            continue
+    for number in [shard.number for shard in find_unwritten(promised)]:
         directory = request.blocks_directory(number)
-        there = {index for index in block_grid.indices() if storage.exists(make_block_path(directory, index))}
+        there = {index for index in block_grid.indices() if make_block_path(directory, index) in files}
         done[number] = there
         waiting += [b for b in list_batches(block_grid, number, request.batch_size) if not there.issuperset(b.indices)]
     if on_blocks:
@@ -354,6 +354,7 @@ def outpaint_scenes(
         on_blocks(per_scene * len(chosen) - sum(len(batch.indices) for batch in waiting))
     if done:
         run_batches(request, chosen, waiting, done, num_actors, on_blocks)
+    require_written(promised)
     return pa.concat_tables(
         storage.read_parquet(make_blocks_table_path(request, number)) for number in range(len(chosen))
     )

@@ -21,7 +21,7 @@ from pipelines.metrics.validity import find_slab_offset_m
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
 from pipelines.schema.run_guard import guard_run
-from pipelines.schema.tables import Shard
+from pipelines.schema.tables import SCENE_TABLES, Shard, find_unwritten, require_written
 from pipelines.training.latents import digest_weights
 
 
@@ -251,7 +251,8 @@ def sample_scenes(
         Number of scenes.
 
     Raises:
-        ValueError: A label is unknown to the model, or the output contains a run of the same name with other options.
+        ValueError: A label is unknown to the model, the output contains a run of the same name with other options, or
+            a shard is not in the output.
     """
     pipeline = load_pipeline(request.model)
     require_labels(pipeline.dit.config.label, request.labels)
@@ -263,15 +264,16 @@ def sample_scenes(
     )
     guard_generation_run(request, pipeline)
     for shard in request.shards()[:1]:
-        for table in ("scenes", "primitives", "rasters"):
-            storage.clean_temporaries(shard.path(table).rsplit("/", 1)[0])
-    shards = request.shards()
-    missing = [shard.number for shard in shards if not shard.is_written()]
-    written = [shard for shard in shards if shard.number not in missing]
-    rows = ({"id": shard.number, "scenes": len(request.indices(shard)), "seconds": 0.0} for shard in written)
+        for table in SCENE_TABLES:
+            storage.clean_temporaries(shard.place(table))
+    promised = {shard: len(request.indices(shard)) for shard in request.shards()}
+    missing = [shard.number for shard in find_unwritten(promised)]
+    written = [shard for shard in promised if shard.number not in missing]
+    rows = ({"id": shard.number, "scenes": promised[shard], "seconds": 0.0} for shard in written)
     total = 0
     for row in chain(rows, map_actors(missing, Sampler, (request, batch_size), num_actors)):
         total += row["scenes"]
         if on_shard:
             on_shard(row)
+    require_written(promised)
     return total

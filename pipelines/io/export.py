@@ -47,32 +47,52 @@ def export_scenes(
         Number of files per format, and the reason for each scene that was not written.
     """
     parts = selection.shards()
+    there = set() if overwrite else list_exported(output, formats)
 
     def write(row: dict) -> dict:
         shard, rows = parts[row["id"]]
-        written, rejects = [], []
+        written, rejects, paths = [], [], []
         for scene in shard.scenes(rows):
             for kind in formats:
                 path = storage.join_uri(output, kind, f"{make_file_name(scene.scene_id)}.{kind}")
                 try:
-                    if overwrite or not storage.exists(path):
+                    if path not in there:
                         content = WRITERS[kind](scene)
                         storage.write_whole(path, lambda stream, content=content: stream.write(content))
                     written.append(kind)
+                    paths.append(path)
                 except ValueError as error:
                     about = {"scene_id": scene.scene_id, "sequence": scene.sequence, "frame": scene.frame}
                     rejects.append(about | {"reason": f"{kind}: {error}"})
         if rejects:
             target = Shard(output, shard.source, shard.split, shard.number)
             storage.write_parquet(make_rejects_table(rejects), target.path("rejects"))
-        return {"scenes": len(rows), "written": written, "rejects": [(r["scene_id"], r["reason"]) for r in rejects]}
+        refused = [(r["scene_id"], r["reason"]) for r in rejects]
+        return {"scenes": len(rows), "written": written, "paths": paths, "rejects": refused}
 
     counts: dict[Format, int] = dict.fromkeys(formats, 0)
     refused: dict[str, str] = {}
+    promised: list[str] = []
     for row in map_rows(make_numbered_rows(range(len(parts))), write).iter_rows():
         for kind in row["written"]:
             counts[kind] += 1
+        promised += row["paths"]
         refused |= {scene_id: reason for scene_id, reason in row["rejects"]}
         if on_scene:
             on_scene(row["scenes"])
+    there = list_exported(output, formats)
+    storage.raise_faults({path: f"{path}: no such file" for path in promised if path not in there}, len(promised))
     return counts, refused
+
+
+def list_exported(output: str, formats: Sequence[Format]) -> set[str]:
+    """List the files of some formats in an output directory.
+
+    Args:
+        output: Output directory.
+        formats: File formats.
+
+    Returns:
+        Paths of the files.
+    """
+    return {path for kind in formats for path in storage.list_files(storage.join_uri(output, kind), f".{kind}")}

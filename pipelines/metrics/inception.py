@@ -18,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from models.local_copy import make_local_copy
 from pipelines.metrics.networks import hash_weights
 
 INPUT_SIZE = 299
@@ -253,7 +254,7 @@ def load_inception(path: str | Path) -> Inception:
     given if the weights are not the published weights.
 
     Args:
-        path: File of type .pth, .pt or .safetensors.
+        path: Path or URI of a file of type .pth, .pt or .safetensors.
 
     Returns:
         The network in evaluation mode.
@@ -262,7 +263,7 @@ def load_inception(path: str | Path) -> Inception:
         ValueError: The file is missing, is corrupted or holds the weights of another network. The message names the
             file.
     """
-    path = Path(path)
+    path = Path(make_local_copy(path))
     sha256 = hash_inception_weights(path)
     try:
         if path.suffix == ".safetensors":

@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
+from models.local_copy import make_local_copy
 from pipelines.metrics.networks import INPUT_SIZE, compute_resized_features
 from pipelines.runtime import storage
 
@@ -215,7 +216,9 @@ def load_lite0(path: str) -> Lite0:
     """
     remedy = "delete the file and convert the weights again with convert_lite0_weights"
     try:
-        tensors = safetensors.torch.load(storage.read_bytes(path))
+        tensors = safetensors.torch.load_file(make_local_copy(path))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error})") from error
     except SafetensorError as error:
         raise ValueError(f"{path}: not a complete safetensors file ({error}); {remedy}") from error
     expected = _list_published_shapes()

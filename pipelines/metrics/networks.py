@@ -12,6 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from models.local_copy import make_local_copy
+
 INPUT_SIZE = 224  # Side of the pictures that networks trained on ImageNet read.
 
 
@@ -19,7 +21,7 @@ def hash_weights(path: str | Path, network: str, known_file: str) -> str:
     """Return the hexadecimal sha256 of a weight file.
 
     Args:
-        path: Weight file.
+        path: Path or URI of the weight file.
         network: Name of the network, for the error message.
         known_file: Name of the published file, for the error message.
 
@@ -29,7 +31,7 @@ def hash_weights(path: str | Path, network: str, known_file: str) -> str:
     Raises:
         ValueError: The file is missing, or its name contains a different sha256.
     """
-    path = Path(path)
+    path = Path(make_local_copy(path))
     if not path.is_file():
         raise ValueError(f"{path}: no such file; {network} weights must be local, such as {known_file}")
     with path.open("rb") as file:

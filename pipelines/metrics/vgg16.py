@@ -15,6 +15,7 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
+from models.local_copy import make_local_copy
 from pipelines.metrics.networks import INPUT_SIZE, compute_resized_features, hash_weights
 
 FEATURES = 4096
@@ -69,7 +70,7 @@ def load_vgg16(path: str | Path) -> VGG16:
     """Load VGG16 with the weights of a local state dict.
 
     Args:
-        path: File of type .pth, .pt or .safetensors, with torchvision's names of the parameters.
+        path: Path or URI of a file of type .pth, .pt or .safetensors, with torchvision's names of the parameters.
 
     Returns:
         The network in evaluation mode.
@@ -78,6 +79,7 @@ def load_vgg16(path: str | Path) -> VGG16:
         ValueError: The file is missing, is corrupted or holds the weights of another network. The message names the
             file and the first wrong tensor.
     """
+    path = make_local_copy(path)
     hash_vgg16_weights(path)
     try:
         if Path(path).suffix == ".safetensors":

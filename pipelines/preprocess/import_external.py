@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 import ray.data
 
+from models.uris import is_uri, split_name, split_options
 from pipelines.io.mesh_import import import_glb
 from pipelines.io.voxel_import import draw_voxels, read_voxels
 from pipelines.metrics.adm_npz import write_npz
@@ -26,7 +27,7 @@ from pipelines.runtime import storage
 from pipelines.runtime.npz import open_npz
 from pipelines.runtime.ray_tasks import map_rows
 from pipelines.schema.axis_convention import Axes
-from pipelines.schema.tables import Shard, make_rejects_table, make_scene_tables
+from pipelines.schema.tables import Shard, make_rejects_table, make_scene_tables, require_written
 from pipelines.schema.validation import validate_table
 
 MAX_FILES_PER_SHARD = 64
@@ -125,27 +126,41 @@ def find_files(patterns: str | Sequence[str], suffix: str) -> tuple[str, tuple[s
     patterns = [patterns] if isinstance(patterns, str) else list(patterns)
     found = [_match_pattern(pattern, suffix) for pattern in patterns]
     base = found[0][0]
-    while not all(f"{one}/".startswith(f"{base}/") for one, _ in found):
-        if "/" not in base.rstrip("/"):
+    while not all(_is_inside(one, base) for one, _ in found):
+        if "/" not in split_options(base)[0].rstrip("/"):
             raise ValueError(f"{patterns[0]} and the other files have no directory in common; import them separately")
-        base = base.rsplit("/", 1)[0]
+        base = split_name(base)[0]
+    start = len(split_options(base)[0]) + 1
     # A file can be named by several patterns.
-    files = sorted({uri[len(base) + 1 :] for _, uris in found for uri in uris})
+    files = sorted({split_options(uri)[0][start:] for _, uris in found for uri in uris})
     names = Counter(make_scene_id(file) for file in files)
     if twice := [name for name, count in names.items() if count > 1]:
         raise ValueError(f"{base}: two files give the same scene id {twice[0]!r}; rename one")
     return base, tuple(files)
 
 
+def _split_pattern(pattern: str) -> tuple[str, str]:
+    """Split a pattern into the part before the options of a URI and the options; options contain "=", wildcards not."""
+    path, mark, options = pattern.rpartition("?") if is_uri(pattern) else ("", "", "")
+    return (path, mark + options) if "=" in options else (pattern, "")
+
+
+def _is_inside(uri: str, base: str) -> bool:
+    (path, options), (folder, wanted) = split_options(uri), split_options(base)
+    return options == wanted and f"{path}/".startswith(f"{folder}/")
+
+
 def _match_pattern(pattern: str, suffix: str) -> tuple[str, list[str]]:
     """Return the directory of a pattern without wildcards, and the URIs of the matching files."""
-    has_wildcard = any(sign in pattern for sign in "*?[")
-    if suffix and pattern.endswith(suffix) and not has_wildcard:
-        directory, uris = pattern.rsplit("/", 1)[0], [pattern] if storage.exists(pattern) else []
+    path, options = _split_pattern(pattern)
+    has_wildcard = any(sign in path for sign in "*?[")
+    if suffix and path.endswith(suffix) and not has_wildcard:
+        directory, uris = split_name(pattern)[0], [pattern] if storage.exists(pattern) else []
     else:
-        directory = pattern.rstrip("/")
+        directory = path.rstrip("/")
         while any(sign in directory for sign in "*?["):
             directory = directory.rsplit("/", 1)[0]
+        directory += options
         uris = [uri for uri in storage.list_files(directory, suffix) if not has_wildcard or fnmatch(uri, pattern)]
     if not uris:
         raise ValueError(
@@ -305,6 +320,8 @@ def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None 
     if request.kind == "npz":
         parts = (make_pictures_shard(request.pictures_path(shard)) for shard in shards)
         write_npz(request.target, (part for part in parts if len(part)), len(scenes))
+    else:
+        require_written({shards[k]: len(names) for k, names in found.items() if names})
     made = options | {"scenes": scenes, "rejects": rejects}
     storage.write_json(made, record)
     if not rejects:

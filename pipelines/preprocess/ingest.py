@@ -1,10 +1,11 @@
 """Convert raw drives to Parquet tables in two passes (paper, supplement A).
 
-Each pass is one Ray Data graph. Pass 1 creates scenes. Each task writes the files of one shard to a staging directory,
-first under temporary names. A killed task therefore leaves no partial file, and a finished shard is not written again.
-Pass 2 needs the whole training split. Pass 2 computes density thresholds, slots per category and value bounds. Pass 2
-then labels the scenes and moves all files to the dataset directory. The file dataset.json is written last and marks the
-dataset as complete. The driver process reads only manifests, not scenes.
+Each pass is one Ray Data graph. Pass 1 creates scenes. Each task writes the files of one shard: the table `scenes` and
+a manifest to a staging directory, all other tables to the dataset directory. Files appear as a whole. A killed task
+therefore leaves no partial file, and a finished shard is not written again. Pass 2 needs the whole training split.
+Pass 2 computes density thresholds, slots per category and value bounds. Pass 2 then labels the scenes and writes the
+table `scenes` to the dataset directory. The file dataset.json is written last and marks the dataset as complete. The
+driver process reads only manifests, not scenes. No file is moved, because object storage would copy it.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import MAX_RETRIES, map_rows
 from pipelines.schema.dataset import DESCRIPTION, Statistics, compute_training_statistics, label_scenes
 from pipelines.schema.run_guard import compare_options
-from pipelines.schema.tables import SCHEMA_VERSION, Shard
+from pipelines.schema.tables import SCENE_TABLES, SCHEMA_VERSION, Shard, require_written
 
 STAGING = ".staging"
 
@@ -45,13 +46,14 @@ def _read_drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
         return str(error)
 
 
-def write_shards(tasks: list[ShardTask], staging: str, grid: Grid) -> Iterator[dict]:
+def write_shards(tasks: list[ShardTask], output: str, staging: str, grid: Grid) -> Iterator[dict]:
     """Yield manifests in order of completion, from one Ray task per shard.
 
     If a drive has several shards, one additional task reads the drive.
 
     Args:
         tasks: Shards to write.
+        output: Dataset directory.
         staging: Staging directory.
         grid: Raster grid of the scenes.
 
@@ -74,7 +76,7 @@ def write_shards(tasks: list[ShardTask], staging: str, grid: Grid) -> Iterator[d
 
     def write(row: dict) -> dict:
         """Write the shard of the task whose number is in the row, and return the manifest."""
-        return {"manifest": json.dumps(write_shard(tasks[row["task"]], staging, grid, read))}
+        return {"manifest": json.dumps(write_shard(tasks[row["task"]], output, staging, grid, read))}
 
     dataset = ray.data.from_items([{"task": k} for k in range(len(tasks))], override_num_blocks=len(tasks))
     for row in map_rows(dataset, write).iter_rows():
@@ -85,9 +87,10 @@ def write_shards(tasks: list[ShardTask], staging: str, grid: Grid) -> Iterator[d
 
 
 def publish_shards(root: str, staging: str, manifests: list[dict], statistics: Statistics) -> None:
-    """Label the scenes and move all staged files to the dataset directory.
+    """Label the scenes and write them to the dataset directory.
 
-    The function can run again after a crash at any point.
+    Files of earlier plans, which have no scenes now, are deleted. The function can run again after a crash at any
+    point.
 
     Args:
         root: Dataset directory.
@@ -96,25 +99,38 @@ def publish_shards(root: str, staging: str, manifests: list[dict], statistics: S
         statistics: Statistics of the training split.
     """
 
-    def move(row: dict) -> dict:
-        """Move the files of the shard whose number is in the row.
-
-        The scenes file is moved last, because it marks the shard as written.
-        """
+    def publish(row: dict) -> dict:
+        """Label the scenes of the shard whose number is in the row."""
         staged, final = (Shard(base, row["source"], row["split"], row["number"]) for base in (staging, root))
-        moved = ["primitives", "rasters"] * bool(row["scenes"]) + ["rejects"] * bool(row["rejects"])
-        for table in moved:
-            if storage.exists(staged.path(table)):
-                storage.move_file(staged.path(table), final.path(table))
-        if row["scenes"]:
-            storage.write_parquet(label_scenes(staged.read("scenes"), statistics), final.path("scenes"))
+        storage.write_parquet(label_scenes(staged.read("scenes"), statistics), final.path("scenes"))
         return row
 
-    rows = [
-        {k: m[k] for k in ("source", "split", "number", "scenes")} | {"rejects": len(m["rejects"])} for m in manifests
-    ]
+    delete_other_files(root, manifests)
+    rows = [{k: m[k] for k in ("source", "split", "number")} for m in manifests if m["scenes"]]
     blocks = min(len(rows), max(2, 4 * int(ray.cluster_resources().get("CPU", 1))))
-    map_rows(ray.data.from_items(rows, override_num_blocks=blocks), move).materialize()
+    map_rows(ray.data.from_items(rows, override_num_blocks=blocks), publish).materialize()
+    shards = [Shard(root, m["source"], m["split"], m["number"]) for m in manifests]
+    promised = list(zip(shards, manifests, strict=True))
+    require_written({shard: m["scenes"] for shard, m in promised if m["scenes"]})
+    storage.require_rows({s.path("rejects"): sum(m["rejects"].values()) for s, m in promised if m["rejects"]})
+
+
+def delete_other_files(root: str, manifests: list[dict]) -> None:
+    """Delete the files of shards that an interrupted run with another plan wrote.
+
+    Args:
+        root: Dataset directory.
+        manifests: Manifests of all shards.
+    """
+    wanted = set()
+    for manifest in manifests:
+        shard = Shard(root, manifest["source"], manifest["split"], manifest["number"])
+        tables = [*SCENE_TABLES] * bool(manifest["scenes"]) + ["rejects"] * bool(manifest["rejects"])
+        wanted |= {shard.path(table) for table in tables}
+    for table in (*SCENE_TABLES, "rejects"):
+        place = storage.join_uri(root, table, f"source={manifests[0]['source']}")
+        for path in set(storage.list_files(place, ".parquet")) - wanted:
+            storage.delete_file(path)
 
 
 # ---------------------------------------------------------------------------------------------------------- run
@@ -183,7 +199,7 @@ def ingest_drives(
     storage.write_json(options, storage.join_uri(staging, "options.json"))
 
     manifests = []
-    for manifest in write_shards(tasks, staging, grid):
+    for manifest in write_shards(tasks, root, staging, grid):
         manifests.append(manifest)
         if on_shard:
             on_shard(manifest)
@@ -223,9 +239,10 @@ def ingest_drives(
 
 def _refuse_other_options(root: str, options: dict) -> None:
     """Raise ValueError if an earlier run wrote to `root` with other options."""
-    for path in (storage.join_uri(root, DESCRIPTION), storage.join_uri(root, STAGING, "options.json")):
+    for names in ((DESCRIPTION,), (STAGING, "options.json")):
+        path = storage.join_uri(root, *names)
         if storage.exists(path):
             recorded = storage.read_json(path)
-            recorded = recorded["options"] if path.endswith(DESCRIPTION) else recorded
+            recorded = recorded["options"] if names == (DESCRIPTION,) else recorded
             if difference := compare_options(recorded, options):
                 raise ValueError(f"{root} was made with {difference}; choose another --output")

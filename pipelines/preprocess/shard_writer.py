@@ -172,14 +172,31 @@ def make_manifest_path(staging: str, task: ShardTask) -> str:
     return storage.join_uri(staging, "manifest", f"{task.source}-{task.split}-{task.number:05d}.json")
 
 
-def write_shard(task: ShardTask, staging: str, grid: Grid, read: ReadDrive = read_drive) -> dict:
+def _is_complete(manifest: dict, task: ShardTask, output: str, staging: str) -> bool:
+    """Return whether the files that a manifest promises exist and are not truncated."""
+    scenes, rejects = manifest["scenes"], sum(manifest["rejects"].values())
+    shard = task.shard(output)
+    promised = {task.shard(staging).path("scenes"): scenes, shard.path("rasters"): scenes} if scenes else {}
+    promised |= {shard.path("rejects"): rejects} if rejects else {}
+    try:
+        storage.require_rows(promised)
+        return not scenes or storage.read_num_rows(shard.path("primitives")) >= 0
+    except ValueError:
+        return False
+
+
+def write_shard(task: ShardTask, output: str, staging: str, grid: Grid, read: ReadDrive = read_drive) -> dict:
     """Write one shard and its manifest; a finished shard is not written again.
+
+    The scenes, whose density labels are not known yet, and the manifest go to the staging directory. All other tables
+    go to the dataset directory.
 
     There is one exception: if the parts of the shard have changed since the run began, the shard is written again.
     Parts change if a drive is added or if poses are repaired.
 
     Args:
         task: Shard to write.
+        output: Dataset directory.
         staging: Staging directory.
         grid: Raster grid of the scenes.
         read: Reader of a drive.
@@ -187,11 +204,11 @@ def write_shard(task: ShardTask, staging: str, grid: Grid, read: ReadDrive = rea
     Returns:
         The manifest.
     """
-    path, shard = make_manifest_path(staging, task), task.shard(staging)
+    path = make_manifest_path(staging, task)
     parts = hashlib.blake2b(repr(task.parts).encode(), digest_size=16).hexdigest()
     if storage.exists(path):
         finished = storage.read_json(path)
-        if finished.get("parts") == parts:
+        if finished.get("parts") == parts and _is_complete(finished, task, output, staging):
             return finished
     started = time.perf_counter()
     cuts = ShardCut(task, grid, read)
@@ -204,11 +221,11 @@ def write_shard(task: ShardTask, staging: str, grid: Grid, read: ReadDrive = rea
     if tables:
         joined = join_tables(tables)
         num_scenes = len(joined["scenes"])
-        # The scenes file marks the shard as written. This file is therefore written last.
-        for name in ("primitives", "rasters", "scenes"):
-            storage.write_parquet(joined[name], shard.path(name))
+        # The scenes lack density labels. They are written last, because they mark the shard as written.
+        for name, root in (("primitives", output), ("rasters", output), ("scenes", staging)):
+            storage.write_parquet(joined[name], task.shard(root).path(name))
     if cuts.rejects:
-        storage.write_parquet(make_rejects_table(cuts.rejects), shard.path("rejects"))
+        storage.write_parquet(make_rejects_table(cuts.rejects), task.shard(output).path("rejects"))
     manifest = {
         "source": task.source,
         "split": task.split,

@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from PIL import Image
 
+from models.local_copy import make_local_copy
+from models.uris import split_name
 from pipelines.rendering.render import arrange_contact_sheet, encode_png
 from pipelines.rendering.street_views import ON_SHEET, encode_animation
 from pipelines.runtime import storage
@@ -79,9 +81,13 @@ class Painter:
         # Weights in other formats are pickles, and code in a model directory must not run.
         local = {"local_files_only": True, "use_safetensors": True, "trust_remote_code": False}
         try:
-            controlnet = ControlNetModel.from_pretrained(request.controlnet, **local)
+            controlnet = ControlNetModel.from_pretrained(make_local_copy(request.controlnet), **local)
             self.pipeline = StableDiffusionControlNetPipeline.from_pretrained(
-                request.diffusion, controlnet=controlnet, safety_checker=None, requires_safety_checker=False, **local
+                make_local_copy(request.diffusion),
+                controlnet=controlnet,
+                safety_checker=None,
+                requires_safety_checker=False,
+                **local,
             )
         except Exception as error:  # Damaged files make diffusers and transformers raise errors of many types.
             raise ValueError(
@@ -162,7 +168,7 @@ def list_frame_names(directory: str) -> list[str]:
     Returns:
         Names such as 000000.png, in order.
     """
-    return [path.rsplit("/", 1)[1] for path in storage.list_files(storage.join_uri(directory, "class_id"), ".png")]
+    return storage.list_names(storage.join_uri(directory, "class_id"), suffix=".png")
 
 
 def list_drives(streets: str) -> list[str]:
@@ -177,7 +183,8 @@ def list_drives(streets: str) -> list[str]:
     Raises:
         ValueError: The directory holds no frame.
     """
-    found = sorted({path.rsplit("/", 2)[0] for path in storage.list_files(streets, ".png") if "/class_id/" in path})
+    folders = {split_name(path)[0] for path in storage.list_files(streets, ".png")}
+    found = sorted(drive for drive, name in map(split_name, folders) if name == "class_id")
     if not found:
         raise ValueError(f"{streets} holds no street views; run jobs/render_streets.py first")
     return found

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from models.scene import CATEGORIES, DENSITIES, GROUND_CLASSES
+from models.uris import split_name
 from pipelines.reporting.chart import format_number
 from pipelines.reporting.dataset_charts import (
     draw_count_histogram,
@@ -157,7 +158,7 @@ def render_dataset_html(facts: DatasetFacts, scenes: Sequence[tuple[Picture, Pic
         *make_reader_sections(facts),
         *make_provenance_sections(facts),
     ]
-    return render_page_html(root.rsplit("/", 1)[-1], sections, root)
+    return render_page_html(split_name(root)[1], sections, root)
 
 
 def make_totals(facts: DatasetFacts) -> KeyFigures:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import shlex
 import subprocess
 import sys
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -36,6 +38,15 @@ def find_commit() -> str:
         return git("rev-parse", "--short=10", "HEAD") + ("+" if git("status", "--porcelain") else "")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
+
+
+@lru_cache(maxsize=1)
+def digest_code() -> str:
+    """Return 12 hexadecimal digits of a hash of all Python files of this package."""
+    digest = hashlib.sha256()
+    for path in sorted(path for package in ("jobs", "models", "pipelines") for path in ROOT.glob(f"{package}/**/*.py")):
+        digest.update(f"{path.relative_to(ROOT)}\n".encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def format_command() -> str:

@@ -1,11 +1,18 @@
-"""Read and write files atomically, on a local disk or on any file system of pyarrow (s3://, gs://, ...)."""
+"""Read and write files atomically, on a local disk or in object storage (s3://, gs://, abfss://).
+
+On a disk, a file is written under a temporary name and then renamed. In object storage, one request writes a whole
+object, so there are no temporary names. Directories do not exist there, and listings replace questions about each file.
+"""
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import secrets
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any
 
@@ -16,26 +23,17 @@ import pyarrow.parquet as pq
 
 from models.limits import LimitError, find_limit, require_within
 from models.strict_json import parse_json
+from models.uris import OBJECT_STORES, connect_fsspec, join_uri, resolve_uri, split_name
+from pipelines.runtime.machines import identify_machine, is_process_alive
 from pipelines.runtime.parquet_sizes import ITEM_BYTES, measure_columns
 
 pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
 
+NUM_THREADS = 16  # Threads that read footers.
 TEMPORARY = ".tmp-"
+ABANDONED_S = 3600.0  # A temporary file of another machine is abandoned after this time without a change (s).
 # A text column that can exceed this size (bytes) is read with dictionary encoding until its total length is known.
 TEXT_BYTES = 2**28
-
-
-def resolve_uri(uri: str | os.PathLike) -> tuple[pafs.FileSystem, str]:
-    """Return the file system and the path of a URI or of a local path; local paths are made absolute."""
-    uri = os.fspath(uri)
-    if "://" in uri:
-        return pafs.FileSystem.from_uri(uri)
-    return pafs.LocalFileSystem(), os.path.abspath(os.path.expanduser(uri))
-
-
-def join_uri(uri: str | os.PathLike, *parts: str) -> str:
-    """Join a URI or path with further parts, using slashes."""
-    return "/".join([os.fspath(uri).rstrip("/"), *parts])
 
 
 def exists(uri: str) -> bool:
@@ -44,25 +42,71 @@ def exists(uri: str) -> bool:
     return fs.get_file_info(path).type != pafs.FileType.NotFound
 
 
+def is_file(uri: str) -> bool:
+    """Return whether a file exists."""
+    fs, path = resolve_uri(uri)
+    return fs.get_file_info(path).is_file
+
+
 def fingerprint_file(uri: str) -> list[str | int]:
     """Return the path, size (bytes) and modification time of a file.
 
     If the file is rewritten, this fingerprint changes.
     """
     fs, path = resolve_uri(uri)
-    info = fs.get_file_info(path)
-    return [path, info.size, str(info.mtime)]
+    return _make_fingerprint(fs.get_file_info(path))
+
+
+def fingerprint_files(uris: Sequence[str]) -> list[list[str | int]]:
+    """Return the fingerprint of each file; each of their directories is listed once.
+
+    Raises:
+        ValueError: A file is missing.
+    """
+    listed: dict[str, dict[str, list[str | int]]] = {}
+    for directory in {split_name(uri)[0] for uri in uris}:
+        fs, path = resolve_uri(directory)
+        found = fs.get_file_info(pafs.FileSelector(path, allow_not_found=True))
+        listed[directory] = {info.base_name: _make_fingerprint(info) for info in found}
+    prints = []
+    for uri in uris:
+        directory, name = split_name(uri)
+        if name not in listed[directory]:
+            raise ValueError(f"{uri}: no such file; run the job that wrote it again")
+        prints.append(listed[directory][name])
+    return prints
+
+
+def _make_fingerprint(info: pafs.FileInfo) -> list[str | int]:
+    return [info.path, info.size, str(info.mtime)]
 
 
 def list_files(uri: str, suffix: str) -> list[str]:
-    """Return the sorted URIs of all visible files under a directory, or [] if the directory does not exist."""
+    """Return the sorted URIs of all visible files under a directory, or [] if the directory does not exist.
+
+    Raises:
+        ValueError: The directory cannot be listed.
+    """
     fs, path = resolve_uri(uri)
-    found = fs.get_file_info(pafs.FileSelector(path, recursive=True, allow_not_found=True))
-    inside = [(info.path[len(path) :].lstrip("/"), info) for info in found if info.is_file]
-    shown = [
-        name for name, _ in inside if name.endswith(suffix) and not any(p.startswith(".") for p in name.split("/"))
-    ]
+    try:
+        found = fs.get_file_info(pafs.FileSelector(path, recursive=True, allow_not_found=True))
+    except OSError as error:
+        raise ValueError(f"{uri}: cannot be listed ({error}); check the path, permissions and connection") from error
+    inside = [info.path[len(path) :].lstrip("/") for info in found if info.is_file]
+    shown = [name for name in inside if name.endswith(suffix) and not any(p.startswith(".") for p in name.split("/"))]
     return [join_uri(uri, name) for name in sorted(shown)]
+
+
+def list_names(uri: str, suffix: str = "", directories: bool = False) -> list[str]:
+    """Return the sorted names of the visible files, or of the visible subdirectories, directly in a directory.
+
+    The list is empty if the directory does not exist.
+    """
+    fs, path = resolve_uri(uri)
+    found = fs.get_file_info(pafs.FileSelector(path, allow_not_found=True))
+    kind = pafs.FileType.Directory if directories else pafs.FileType.File
+    names = sorted(info.base_name for info in found if info.type == kind and not info.base_name.startswith("."))
+    return [name for name in names if name.endswith(suffix)]
 
 
 def write_whole(uri: str, write: Callable[[Any], None]) -> None:
@@ -75,26 +119,103 @@ def write_whole(uri: str, write: Callable[[Any], None]) -> None:
         OSError: The file cannot be written. The message names the file and the remedy.
     """
     fs, path = resolve_uri(uri)
+    try:
+        if fs.type_name in OBJECT_STORES:
+            _put_object(fs, path, write)
+        else:
+            _write_and_rename(fs, path, write)
+    except OSError as error:
+        raise _make_write_error(uri, error) from error
+
+
+def _put_object(fs: pafs.FileSystem, path: str, write: Callable[[Any], None]) -> None:
+    """Write an object as a whole: if `write` fails, nothing is sent."""
+    content = io.BytesIO()
+    write(content)
+    with fs.open_output_stream(path) as stream:
+        stream.write(content.getbuffer())
+
+
+def _write_and_rename(fs: pafs.FileSystem, path: str, write: Callable[[Any], None]) -> None:
+    """Write a file under a temporary name, and rename it."""
     parent, name = path.rsplit("/", 1)
     # The temporary file has another suffix, because *.parquet patterns of DuckDB also match hidden files.
-    # Nobody can guess the random part, so nobody can plant a link under this name in a shared directory.
-    temporary = f"{parent}/{TEMPORARY}{name}-{secrets.token_hex(8)}"
+    temporary = f"{parent}/{make_temporary_name(name)}"
     try:
         fs.create_dir(parent, recursive=True)
         with fs.open_output_stream(temporary) as stream:
             write(stream)
         fs.move(temporary, path)
-    except BaseException as error:
+    except BaseException:
         if fs.get_file_info(temporary).is_file:
             fs.delete_file(temporary)
-        if isinstance(error, OSError):
-            reason = os.strerror(error.errno) if error.errno else str(error)
-            raise OSError(
-                f"{uri}: cannot be written ({reason}); free disk space or give write permission, then run the same"
-                " command again"
-            ) from error
         raise
-    _delete_files(fs, pafs.FileSelector(parent), f"{TEMPORARY}{name}-")
+    _delete_abandoned(fs, pafs.FileSelector(parent), f"{TEMPORARY}{name}-")
+
+
+def make_temporary_name(name: str) -> str:
+    """Return a temporary name that states the machine and the process of the writer.
+
+    Nobody can guess the random part, so nobody can plant a link under this name in a shared directory.
+    """
+    return f"{TEMPORARY}{name}-{identify_machine()}-{os.getpid()}-{secrets.token_hex(8)}"
+
+
+def _is_abandoned(info: pafs.FileInfo, now_ns: int) -> bool:
+    """Return whether the writer of a temporary file has ended.
+
+    The processes of another machine are not visible here. Its files are abandoned after ABANDONED_S seconds without a
+    change.
+    """
+    machine, process, _ = info.base_name.rsplit("-", 3)[1:] if info.base_name.count("-") >= 3 else ("", "", "")
+    if machine == identify_machine() and process.isdecimal():
+        return not is_process_alive(int(process))
+    return now_ns - (info.mtime_ns or 0) > ABANDONED_S * 10**9
+
+
+def create_file(uri: str, content: bytes) -> bool:
+    """Create a small file unless it exists. If several processes call this function concurrently, one succeeds.
+
+    Object storage needs a conditional request, which pyarrow lacks; fsspec sends it (s3fs, gcsfs or adlfs).
+
+    Args:
+        uri: File.
+        content: Content of the file.
+
+    Returns:
+        Whether this call created the file.
+
+    Raises:
+        OSError: The file cannot be written. The message names the file and the remedy.
+        ValueError: The package for this kind of object storage is missing.
+    """
+    fs, path = resolve_uri(uri)
+    try:
+        if fs.type_name in OBJECT_STORES:
+            connect_fsspec(uri).pipe_file(path, content, mode="create")
+        else:
+            fs.create_dir(path.rsplit("/", 1)[0], recursive=True)
+            with open(path, "xb") as file:
+                file.write(content)
+    except FileExistsError:
+        return False
+    except OSError as error:
+        raise _make_write_error(uri, error) from error
+    return True
+
+
+def _make_write_error(uri: str, error: OSError) -> OSError:
+    reason = os.strerror(error.errno) if error.errno else str(error)
+    return OSError(
+        f"{uri}: cannot be written ({reason}); free disk space or give write permission, then run the same command"
+        " again"
+    )
+
+
+def find_time_ns(uri: str) -> int:
+    """Return the modification time of a file by the clock of its store (ns since 1970), or 0 if there is no file."""
+    fs, path = resolve_uri(uri)
+    return fs.get_file_info(path).mtime_ns or 0
 
 
 def write_parquet(table: pa.Table, uri: str) -> None:
@@ -218,6 +339,22 @@ def _decode_texts(table: pa.Table, encoded: Sequence[str]) -> pa.Table:
     return table.cast(pa.schema(fields, table.schema.metadata))
 
 
+def read_num_rows(uri: str) -> int:
+    """Return the number of rows that the footer of a Parquet file states.
+
+    Raises:
+        ValueError: The file is missing or is not a complete Parquet file. The message names the file.
+    """
+    fs, path = resolve_uri(uri)
+    try:
+        with fs.open_input_file(path) as stream:
+            return pq.read_metadata(stream).num_rows
+    except FileNotFoundError:
+        raise ValueError(f"{uri}: no such file") from None
+    except Exception as error:  # A damaged file makes pyarrow raise errors of many types.
+        raise ValueError(f"{uri}: not a complete Parquet file ({error})") from error
+
+
 def read_bytes(uri: str, limit: str = "") -> bytes:
     """Read a whole file.
 
@@ -241,6 +378,62 @@ def read_bytes(uri: str, limit: str = "") -> bytes:
     if limit:
         require_within(limit, len(content), uri, is_partial=True)
     return content
+
+
+def find_faulty_files(promised: Mapping[str, int]) -> dict[str, str]:
+    """Find the Parquet files that are missing, damaged or have another number of rows than promised.
+
+    Directories are listed once, and footers are read concurrently.
+
+    Args:
+        promised: Number of rows of each file.
+
+    Returns:
+        Description of the fault of each faulty file.
+    """
+    there = {path for place in {split_name(uri)[0] for uri in promised} for path in list_files(place, ".parquet")}
+
+    def find_fault(uri: str) -> str:
+        if uri not in there:
+            return f"{uri}: no such file"
+        try:
+            rows = read_num_rows(uri)
+        except ValueError as error:
+            return str(error)
+        return "" if rows == promised[uri] else f"{uri}: {rows:,} rows, expected {promised[uri]:,}"
+
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        faults = zip(promised, pool.map(find_fault, promised), strict=True)
+    return {uri: fault for uri, fault in faults if fault}
+
+
+def require_rows(promised: Mapping[str, int]) -> None:
+    """Check that a job has written the Parquet files that it reports.
+
+    Args:
+        promised: Number of rows of each file.
+
+    Raises:
+        ValueError: A file is missing, is damaged or has another number of rows. The message names the file.
+    """
+    raise_faults(find_faulty_files(promised), len(promised))
+
+
+def raise_faults(faults: Mapping[Any, str], count: int) -> None:
+    """Raise an error if files of a job's output are faulty.
+
+    Args:
+        faults: Description of the fault of each faulty file or shard.
+        count: Number of files or shards that were checked.
+
+    Raises:
+        ValueError: There is a fault. The message states the first fault and the remedy.
+    """
+    if faults:
+        raise ValueError(
+            f"{next(iter(faults.values()))}; {len(faults)} of {count} parts of the output are incomplete; run the same"
+            " command again, and check that all nodes write to the same storage"
+        )
 
 
 def measure_file_bytes(uri: str) -> int:
@@ -274,16 +467,20 @@ def read_json(uri: str) -> Any:
 
 
 def clean_temporaries(uri: str) -> int:
-    """Delete the temporary files of killed writers and return their number."""
+    """Delete the temporary files of killed writers and return their number. The files of live writers are kept."""
     fs, path = resolve_uri(uri)
-    return _delete_files(fs, pafs.FileSelector(path, recursive=True, allow_not_found=True), TEMPORARY)
+    if fs.type_name in OBJECT_STORES:
+        return 0
+    return _delete_abandoned(fs, pafs.FileSelector(path, recursive=True, allow_not_found=True), TEMPORARY)
 
 
-def _delete_files(fs: pafs.FileSystem, where: pafs.FileSelector, prefix: str) -> int:
-    """Delete the files whose names begin with `prefix` and return their number."""
-    stale = [info.path for info in fs.get_file_info(where) if info.is_file and info.base_name.startswith(prefix)]
+def _delete_abandoned(fs: pafs.FileSystem, where: pafs.FileSelector, prefix: str) -> int:
+    """Delete the temporary files whose names begin with `prefix` and whose writers have ended; return their number."""
+    now_ns = time.time_ns()
+    found = [info for info in fs.get_file_info(where) if info.is_file and info.base_name.startswith(prefix)]
+    stale = [info.path for info in found if _is_abandoned(info, now_ns)]
     for name in stale:
-        with suppress(FileNotFoundError):  # The writer was not killed and has renamed the file.
+        with suppress(FileNotFoundError):  # Another process has deleted the file.
             fs.delete_file(name)
     return len(stale)
 
@@ -291,20 +488,12 @@ def _delete_files(fs: pafs.FileSystem, where: pafs.FileSelector, prefix: str) ->
 def delete_file(uri: str) -> None:
     """Delete a file if it exists."""
     fs, path = resolve_uri(uri)
-    if fs.get_file_info(path).is_file:
+    with suppress(FileNotFoundError):
         fs.delete_file(path)
 
 
 def delete_directory(uri: str) -> None:
     """Delete a directory if it exists."""
     fs, path = resolve_uri(uri)
-    if fs.get_file_info(path).type == pafs.FileType.Directory:
+    with suppress(FileNotFoundError):
         fs.delete_dir(path)
-
-
-def move_file(source: str, target: str) -> None:
-    """Move a file; create the target directory if necessary."""
-    fs, path = resolve_uri(source)
-    _, to = resolve_uri(target)
-    fs.create_dir(to.rsplit("/", 1)[0], recursive=True)
-    fs.move(path, to)

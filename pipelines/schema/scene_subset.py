@@ -78,7 +78,8 @@ class SceneSubset:
 
         The result changes when the selection or a file changes.
         """
-        return [[*storage.fingerprint_file(shard.path("scenes")), rows] for shard, rows in self._shards]
+        prints = storage.fingerprint_files([shard.path("scenes") for shard, _ in self._shards])
+        return [[*found, rows] for found, (_, rows) in zip(prints, self._shards, strict=True)]
 
     @cached_property
     def _shards(self) -> list[tuple[Shard, list[int]]]:

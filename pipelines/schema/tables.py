@@ -9,8 +9,10 @@ columns. docs/reference/tables.md documents the tables for users.
 from __future__ import annotations
 
 import json
+import logging
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -20,10 +22,14 @@ import pyarrow as pa
 from models.geometry.cholesky import compute_cholesky_parameters
 from models.limits import LimitError
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
+from models.uris import split_options
 from pipelines.runtime import storage
 from pipelines.schema.validation import encode_texts, validate_shard, validate_table
 
+logger = logging.getLogger(__name__)
+
 TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
+SCENE_TABLES = ("scenes", "primitives", "rasters")  # Tables that every shard has.
 TEXTS = ("scene_id", "category", "label", "kind")  # Text columns of the table `primitives`.
 SCHEMA_VERSION = "1"  # Version of the column names and types. Descriptions may change within a version.
 HEIGHT_STEP_M = 0.01
@@ -522,8 +528,18 @@ class Shard:
         Returns:
             Path or URI of the Parquet file.
         """
-        name = f"part-{self.number:05d}.parquet"
-        return storage.join_uri(self.root, table, f"source={self.source}", f"split={self.split}", name)
+        return storage.join_uri(self.place(table), f"part-{self.number:05d}.parquet")
+
+    def place(self, table: str) -> str:
+        """Return the directory of a table's files for this source and split.
+
+        Args:
+            table: Name of the table, such as scenes.
+
+        Returns:
+            Path or URI of the directory.
+        """
+        return storage.join_uri(self.root, table, f"source={self.source}", f"split={self.split}")
 
     def read(self, table: str, columns: list[str] | None = None, encoded: Sequence[str] = ()) -> pa.Table:
         """Read the shard's rows of a table, and validate each column.
@@ -605,7 +621,83 @@ class Shard:
 
     def is_written(self) -> bool:
         """Return whether the files of the tables scenes, primitives and rasters exist."""
-        return all(storage.exists(self.path(table)) for table in ("scenes", "primitives", "rasters"))
+        return all(storage.exists(self.path(table)) for table in SCENE_TABLES)
+
+    def find_fault(self, num_scenes: int | None = None) -> str:
+        """Compare the files of the tables scenes, primitives and rasters with each other.
+
+        The function reads the footers of the files and one column of `scenes`; it does not validate the other values.
+
+        Args:
+            num_scenes: Expected number of scenes (default: the number in `scenes`).
+
+        Returns:
+            Description of a missing file, a damaged file or a wrong number of rows; "" if there is none.
+        """
+        try:
+            counts = storage.read_parquet(self.path("scenes"), ["num_primitives"])["num_primitives"]
+            scenes = len(counts) if num_scenes is None else num_scenes
+            expected = {"scenes": scenes, "rasters": scenes, "primitives": sum(counts.to_pylist())}
+            found = {"scenes": len(counts)} | {
+                table: storage.read_num_rows(self.path(table)) for table in ("primitives", "rasters")
+            }
+        except ValueError as error:
+            return str(error)
+        for table, rows in expected.items():
+            if found[table] != rows:
+                return f"{self.path(table)}: {found[table]:,} rows, expected {rows:,}"
+        return ""
+
+
+def find_faults(promised: Mapping[Shard, int]) -> dict[Shard, str]:
+    """Find the shards that are missing, damaged or have another number of scenes than promised.
+
+    Directories are listed once, and footers are read concurrently.
+
+    Args:
+        promised: Number of scenes of each shard.
+
+    Returns:
+        Description of the fault of each faulty shard (`Shard.find_fault`).
+    """
+    places = {shard.place(table) for shard in promised for table in SCENE_TABLES}
+    there = {path for place in places for path in storage.list_files(place, ".parquet")}
+
+    def find_fault(shard: Shard) -> str:
+        missing = [path for path in map(shard.path, SCENE_TABLES) if path not in there]
+        return f"{missing[0]}: no such file" if missing else shard.find_fault(promised[shard])
+
+    with ThreadPoolExecutor(storage.NUM_THREADS) as pool:
+        faults = zip(promised, pool.map(find_fault, promised), strict=True)
+    return {shard: fault for shard, fault in faults if fault}
+
+
+def require_written(promised: Mapping[Shard, int]) -> None:
+    """Check that a job has written the shards that it reports.
+
+    Args:
+        promised: Number of scenes of each shard.
+
+    Raises:
+        ValueError: A shard is missing, damaged or has another number of scenes.
+    """
+    storage.raise_faults(find_faults(promised), len(promised))
+
+
+def find_unwritten(promised: Mapping[Shard, int]) -> list[Shard]:
+    """Return the shards that a resumed job must write, in order. A damaged shard is reported as a warning.
+
+    Args:
+        promised: Number of scenes of each shard.
+
+    Returns:
+        Shards with a fault (`find_faults`).
+    """
+    faults = find_faults(promised)
+    for fault in faults.values():
+        if not fault.endswith("no such file"):
+            logger.warning("%s; the shard is written again", fault)
+    return list(faults)
 
 
 def find_shards(root: str, table: str = "scenes", source: str | None = None, split: str | None = None) -> list[Shard]:
@@ -625,7 +717,7 @@ def find_shards(root: str, table: str = "scenes", source: str | None = None, spl
     """
     shards = []
     for path in storage.list_files(storage.join_uri(root, table), ".parquet"):
-        source_part, split_part, name = f"//{path}".rsplit("/", 3)[1:]
+        source_part, split_part, name = f"//{split_options(path)[0]}".rsplit("/", 3)[1:]
         found = (source_part.removeprefix("source="), split_part.removeprefix("split="))
         if (source or found[0], split or found[1]) == found:
             number = name.removeprefix("part-").removesuffix(".parquet")
@@ -640,7 +732,9 @@ def find_shards(root: str, table: str = "scenes", source: str | None = None, spl
             storage.join_uri(root, table),
             "/".join(f"{k}={v}" for k, v in (("source", source), ("split", split)) if v),
         )
-        there = sorted({"/".join(path.split("/")[-3:-1]) for path in storage.list_files(place, ".parquet")})
+        there = sorted(
+            {"/".join(split_options(path)[0].split("/")[-3:-1]) for path in storage.list_files(place, ".parquet")}
+        )
         if there:
             raise ValueError(f"{place} holds no {wanted}; it holds {', '.join(there)}")
         raise ValueError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 import pyarrow as pa
@@ -28,8 +29,6 @@ def digest_weights(model: torch.nn.Module) -> str:
 
 def load_lvae(directory: str) -> LayoutVAE:
     """Load a layout VAE. Raises ValueError if the directory does not contain a layout VAE."""
-    if not storage.exists(storage.join_uri(directory, "config.json")):
-        raise ValueError(f"{directory}: no layout VAE here; run jobs/train_lvae.py first")
     try:
         return LayoutVAE.from_pretrained(directory).requires_grad_(False)
     except (OSError, ValueError, TypeError) as error:
@@ -43,8 +42,9 @@ class Encoder:
     channel.
     """
 
-    def __init__(self, lvae: str, output: str, shards: list[Shard], batch_size: int) -> None:
+    def __init__(self, lvae: str, output: str, shards: list[Shard], there: set[str], batch_size: int) -> None:
         self.model, self.output, self.shards, self.batch_size = load_lvae(lvae), output, shards, batch_size
+        self.there = there  # Files of an interrupted run.
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
         self.model.to(self.device)
 
@@ -64,15 +64,18 @@ class Encoder:
     def __call__(self, row: dict) -> dict:
         shard = self.shards[row["id"]]
         target = Shard(self.output, shard.source, shard.split, shard.number)
-        if storage.exists(target.path("latents")):
-            mean = target.read("latents", ["mean"])["mean"].combine_chunks().to_numpy_ndarray()
-        else:
+        mean = None
+        if target.path("latents") in self.there:
+            with suppress(ValueError):  # A damaged file is written again.
+                mean = target.read("latents", ["mean"])["mean"].combine_chunks().to_numpy_ndarray()
+        if mean is None:
             ids, mean, logvar = self.encode(shard)
             tensors = [pa.FixedShapeTensorArray.from_numpy_ndarray(v) for v in (mean, logvar)]
             schema = make_latents_schema(mean.shape[1:])
             storage.write_parquet(pa.table([pa.array(ids), *tensors], schema=schema), target.path("latents"))
         values = mean.astype(np.float64)
         return {
+            "id": row["id"],
             "split": shard.split,
             "count": len(mean),
             "sum": values.sum(axis=(0, 2, 3)),
@@ -124,14 +127,18 @@ def encode_latents(
     shards = find_shards(dataset.root, source=dataset.source)
     total: np.ndarray | float = 0.0
     square: np.ndarray | float = 0.0
-    cells, counts = 0, {}
-    for row in map_actors(range(len(shards)), Encoder, (lvae, output, shards, batch_size), num_actors):
+    cells, counts, promised = 0, {}, {}
+    there = set(storage.list_files(storage.join_uri(output, "latents"), ".parquet"))
+    for row in map_actors(range(len(shards)), Encoder, (lvae, output, shards, there, batch_size), num_actors):
+        shard = shards[row["id"]]
+        promised[Shard(output, shard.source, shard.split, shard.number).path("latents")] = int(row["count"])
         counts[row["split"]] = counts.get(row["split"], 0) + int(row["count"])
         if row["split"] == "train":
             total, square = total + row["sum"], square + row["square"]
             cells += int(row["count"]) * int(row["cells"])
         if on_shard:
             on_shard(row)
+    storage.require_rows(promised)
     mean = np.asarray(total / cells)
     content |= {
         "complete": True,

@@ -172,7 +172,7 @@ def add_delay(function: Callable, seconds: float) -> Callable:
 def test_ingest_is_unchanged_by_random_worker_kills(shards, tmp_path, monkeypatch, seed):
     (tasks, undisturbed), quota = (
         shards,
-        {"_read_drive_or_reason": 1, "Map(write)": 3, "compute_training_statistics": 1, "Map(move)": 2},
+        {"_read_drive_or_reason": 1, "Map(write)": 3, "compute_training_statistics": 1, "Map(publish)": 2},
     )
     for name, seconds in (
         ("_read_drive_or_reason", 0.6),
@@ -192,14 +192,14 @@ def test_ingest_is_unchanged_by_worker_kill_during_write(shards, tmp_path, monke
     (tasks, undisturbed), root, died = shards, tmp_path / "out", tmp_path / "died"
     died.mkdir()
     doomed = (
-        ".staging/rasters/source=kitti360/split=train/part-00001.parquet",
+        "out/rasters/source=kitti360/split=train/part-00001.parquet",
         ".staging/manifest/kitti360-train-00003.json",
         "out/scenes/source=kitti360/split=train/part-00002.parquet",
     )
 
     def arm_writers(function: Callable) -> Callable:
         def call(*arguments: Any) -> Any:
-            whole, at_once = storage.write_whole, storage.move_file
+            whole = storage.write_whole
 
             def write_whole(uri: str, write: Callable) -> None:
                 marker = died / str(len(uri))
@@ -212,12 +212,8 @@ def test_ingest_is_unchanged_by_worker_kill_during_write(shards, tmp_path, monke
 
                 whole(uri, die if uri.endswith(doomed) and not marker.exists() else write)
 
-            def move(source: str, target: str) -> None:
-                time.sleep(0.1 * target.startswith(str(root)))  # the delay would make a partial shard visible
-                at_once(source, target)
-
             if not hasattr(storage, "armed"):
-                storage.write_whole, storage.move_file, storage.armed = write_whole, move, True
+                storage.write_whole, storage.armed = write_whole, True
             return function(*arguments)
 
         return call
@@ -269,10 +265,10 @@ def test_preprocess_resumes_after_driver_kills(town, tmp_path):
     with assert_no_partial_shards(root):
         run_and_kill_job(root, log, lambda: any(staging.glob("manifest/*.json")))
         done = sorted(path.stem for path in staging.glob("manifest/*.json"))
-        assert 1 <= len(done) < 12 and not any((root / name).exists() for name in (*TABLES, "dataset.json"))
+        assert 1 <= len(done) < 12 and not any((root / name).exists() for name in ("scenes", "dataset.json"))
         _, split, number = done[0].split("-")
         kept = f"rasters/source=town/split={split}/part-{number}.parquet"
-        stamp = (staging / kept).stat().st_mtime_ns
+        stamp = (root / kept).stat().st_mtime_ns
 
         run_and_kill_job(root, log, lambda: any(root.glob("scenes/*/*/*.parquet")))
         assert len(list(staging.glob("manifest/*.json"))) == 12 and not (root / "dataset.json").exists()
@@ -320,7 +316,7 @@ def test_preprocess_reports_full_disk_and_resumes(town, tmp_path):
     assert re.fullmatch(
         rf"error: {full}/\S+: cannot be written \(No space left on device\); free disk space.*", lines[0]
     )
-    assert not (left / "dataset.json").exists() and find_partial_shards(left / ".staging", set()) == []
+    assert not (left / "dataset.json").exists() and find_partial_shards(left, set()) == []
     preprocess(replace(TOWN, output=str(left)))
     assert_same(left, town)
     if "Traceback" in done.stderr:
@@ -336,11 +332,11 @@ def test_write_shard_names_failed_file_and_cleans_up(raw, tmp_path):
         with pytest.raises(
             OSError, match=r"staging/.*\.parquet: cannot be written \(File too large\); free disk space"
         ):
-            write_shard(task, str(staging), CROP)
+            write_shard(task, str(staging), str(staging), CROP)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert find_partial_shards(staging, set()) == [] and not list(staging.rglob(f"{storage.TEMPORARY}*"))
-    assert write_shard(task, str(staging), CROP)["scenes"] == 4
+    assert write_shard(task, str(staging), str(staging), CROP)["scenes"] == 4
 
 
 # ------------------------------------------------------------------------------------------------- unreadable drives
@@ -386,10 +382,10 @@ def test_write_shard_detects_poses_changed_during_run(raw, tmp_path):
     lines = path.read_text().splitlines(keepends=True)
     (task,) = plan_kitti360(str(root), split=False)
     path.write_text("".join(lines[:2]))
-    manifest = write_shard(task, staging, CROP)
+    manifest = write_shard(task, staging, staging, CROP)
     assert manifest["scenes"] == 0 and "the poses of 0007 changed after this run began" in manifest["unreadable"][0]
     path.write_text("".join([*lines[:3], lines[3].replace(str(task.parts[0].frames[3]), "99999", 1)]))
-    assert write_shard(task, staging, CROP)["unreadable"]
+    assert write_shard(task, staging, staging, CROP)["unreadable"]
 
 
 def test_write_shard_rewrites_staged_shard_of_another_plan(raw, tmp_path):
@@ -401,7 +397,7 @@ def test_write_shard_rewrites_staged_shard_of_another_plan(raw, tmp_path):
     for kept in (lines[:2], lines[2:]):
         path.write_text("".join(kept))
         (task,) = plan_kitti360(str(root), split=False)
-        write_shard(task, staging, CROP)
+        write_shard(task, staging, staging, CROP)
         frames = pq.read_table(task.shard(staging).path("scenes"), partitioning=None)["frame"].to_pylist()
         assert frames == [int(line.split()[0]) for line in kept]
 
@@ -421,7 +417,7 @@ PLANS = {
 def write_all_shards(source: str, root: Path, staging: Path) -> tuple[Tables, list[dict]]:
     """Write all shards of a source, check them, and return the rows of every table and the manifests."""
     tasks = PLANS[source](str(root))
-    manifests = [write_shard(task, str(staging), CROP) for task in tasks]
+    manifests = [write_shard(task, str(staging), str(staging), CROP) for task in tasks]
     tables: Tables = {"scenes": [], "primitives": [], "rasters": [], "rejects": []}
     for task in tasks:
         paths = {name: Path(task.shard(str(staging)).path(name)) for name in tables}

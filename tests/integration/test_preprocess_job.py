@@ -15,6 +15,7 @@ from pipelines.preprocess.sharding import plan_argoverse2, plan_kitti360, plan_t
 from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.town.generator import generate_town, select_poses, write_kitti360
 from pipelines.runtime import storage
+from pipelines.runtime.machines import identify_machine
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.density_labels import classify_density, compute_density_thresholds
 from pipelines.schema.tables import find_shards, read_scenes
@@ -88,9 +89,9 @@ def test_preprocess_resumes_interrupted_run_to_same_tables(cluster, town, tmp_pa
     tasks, root = plan_town(24, 8, 0), str(tmp_path)
     staging = storage.join_uri(root, ingest.STAGING)
     storage.write_json({"source": "town"}, storage.join_uri(staging, "options.json"))
-    done = write_shard(tasks[0], staging, Grid())
-    stamp = Path(tasks[0].shard(staging).path("rasters")).stat().st_mtime_ns
-    stale = Path(staging) / "rasters" / f"{storage.TEMPORARY}1-part"
+    done = write_shard(tasks[0], root, staging, Grid())
+    stamp = Path(tasks[0].shard(root).path("rasters")).stat().st_mtime_ns
+    stale = tmp_path / "rasters" / f"{storage.TEMPORARY}part-{identify_machine()}-{2**31 - 1}-1"
     stale.write_text("half")
     assert done["scenes"] > 0 and not (tmp_path / "scenes").exists()
     ingest.ingest_drives(tasks, root, {"source": "town"})

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from models.local_copy import find_cache_directory
 from models.pretrained import CHECKSUMS_NAME, compute_checksums
 
 
@@ -56,7 +57,7 @@ def test_publish_writes_model_with_card_and_finds_it(smoke, evaluation_directory
     for name in ("tiny", reference, run_id):
         again = load_pipeline(find_pipeline_directory(name)).dit.state_dict()
         assert {name: value.tolist() for name, value in again.items()} == trained
-    kept = smoke / "registry" / run_id
+    kept = find_cache_directory("registry") / run_id
     assert (
         json.loads((kept / CHECKSUMS_NAME).read_text()) == compute_checksums(kept)
         and len(list(kept.parent.iterdir())) == 1
@@ -67,7 +68,7 @@ def test_publish_writes_model_with_card_and_finds_it(smoke, evaluation_directory
     damaged.write_text(damaged.read_text() + " ")
     with pytest.raises(ValueError, match=r"models:/tiny/2: its files do not match its checksums.json"):
         find_pipeline_directory(second[1])
-    assert not (smoke / "registry" / second[2]).exists()
+    assert not (kept.parent / second[2]).exists()
     assert publish(Config(name="tiny", evaluation=str(evaluation_directory), register=False)) == [output]
 
 

@@ -1,6 +1,7 @@
 """Tests of tables: scenes are the same after writing and reading, and DuckDB can query the files."""
 
 import os
+import time
 
 import duckdb
 import numpy as np
@@ -10,6 +11,7 @@ from helpers import random_scene
 
 from models.scene import Grid
 from pipelines.runtime import storage
+from pipelines.runtime.machines import identify_machine
 from pipelines.schema.tables import HEIGHT_STEP_M, PRIMITIVES, SCENES, Shard, find_shards, read_scenes
 
 
@@ -114,8 +116,14 @@ def test_shard_write_is_atomic(tmp_path):
     assert list((tmp_path / "a").iterdir()) == []
     storage.write_json({"a": 1}, target)
     assert storage.read_json(target) == {"a": 1}
-    (tmp_path / "a" / f"{storage.TEMPORARY}1-x").write_text("")
-    assert storage.clean_temporaries(str(tmp_path)) == 1
+    for process in (os.getpid(), 2**31 - 1):
+        (tmp_path / "a" / f"{storage.TEMPORARY}x-{identify_machine()}-{process}-0").write_text("")
+    other, old = (tmp_path / "a" / f"{storage.TEMPORARY}x-{'0' * 12}-1-{age}" for age in ("new", "old"))
+    other.write_text("")
+    old.write_text("")
+    os.utime(old, (time.time() - 2 * storage.ABANDONED_S,) * 2)
+    assert storage.clean_temporaries(str(tmp_path)) == 2  # of an ended process and the old one of another machine
+    assert other.exists() and len(list((tmp_path / "a").iterdir())) == 3
     (tmp_path / "a" / "b.json").write_text("{")
     with pytest.raises(ValueError, match=r"b.json: cannot be read as JSON"):
         storage.read_json(target)

@@ -13,7 +13,7 @@ frame. An invalid log raises ValueError; the message names file, value and remed
 from __future__ import annotations
 
 import hashlib
-from pathlib import Path
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from models.limits import require_within
 from models.scene import CATEGORY_INDEX
 from pipelines.preprocess.sources.drive import Drive, MapGround
 from pipelines.preprocess.sources.files import are_all_numbers, read_file, read_json_file
+from pipelines.preprocess.sources.input_paths import InputPath, find_local_file, make_input_path
 from pipelines.runtime.feather_sizes import measure_feather
 
 pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
@@ -73,7 +74,7 @@ MAX_COORDINATE_M = 1e6
 MAX_HEIGHT_M = 1e4
 
 
-def list_logs(root: str | Path) -> list[tuple[str, str]]:
+def list_logs(root: str | PathLike) -> list[tuple[str, str]]:
     """Return the annotated logs: first train, then val.
 
     The test split has no annotations.
@@ -90,7 +91,7 @@ def list_logs(root: str | Path) -> list[tuple[str, str]]:
     found = [
         (split, folder.name)
         for split in SPLITS
-        for folder in sorted(Path(root, split).glob("*/"))
+        for folder in sorted(make_input_path(root, split).glob("*/"))
         if not folder.name.startswith(".")
     ]
     if not found:
@@ -101,7 +102,7 @@ def list_logs(root: str | Path) -> list[tuple[str, str]]:
     return found
 
 
-def read_drive(root: str | Path, split: str, log: str) -> Drive:
+def read_drive(root: str | PathLike, split: str, log: str) -> Drive:
     """Read the annotated sweeps of one log.
 
     `frame` and `timestamp` are the time of a sweep (ns). `instance_id` is a hash of the track's uuid. The hash does not
@@ -118,9 +119,9 @@ def read_drive(root: str | Path, split: str, log: str) -> Drive:
     Raises:
         ValueError: A file or value is missing or invalid; the message names the file.
     """
+    folder = make_input_path(root, split, log)
     if split == "test":
-        raise ValueError(f"{Path(root, split, log)}: Argoverse 2's test split has no annotations; use train or val")
-    folder = Path(root, split, log)
+        raise ValueError(f"{folder}: Argoverse 2's test split has no annotations; use train or val")
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such log; check --input and unpack the log")
     boxes = _read_annotations(folder / "annotations.feather")
@@ -153,7 +154,7 @@ def read_drive(root: str | Path, split: str, log: str) -> Drive:
 # ---------------------------------------------------------------------------------------------------- feather
 
 
-def _read_annotations(path: Path) -> dict[str, np.ndarray]:
+def _read_annotations(path: InputPath) -> dict[str, np.ndarray]:
     """Return the required columns (n,) of the annotations, after all checks."""
     numbers = (*SIZE, *QUATERNION, *TRANSLATION)
     columns = _read_feather(path, integers=("timestamp_ns",), texts=("track_uuid", "category"), numbers=numbers)
@@ -170,7 +171,7 @@ def _read_annotations(path: Path) -> dict[str, np.ndarray]:
     return columns
 
 
-def _read_poses(path: Path, frame: np.ndarray) -> np.ndarray:
+def _read_poses(path: InputPath, frame: np.ndarray) -> np.ndarray:
     """Return city_from_ego (p, 3, 4), in metres, at the timestamps `frame` (p,), which are sorted."""
     columns = _read_feather(path, integers=("timestamp_ns",), texts=(), numbers=(*QUATERNION, *TRANSLATION))
     for name in TRANSLATION:
@@ -186,7 +187,7 @@ def _read_poses(path: Path, frame: np.ndarray) -> np.ndarray:
 
 
 def _read_feather(
-    path: Path, integers: tuple[str, ...], texts: tuple[str, ...], numbers: tuple[str, ...]
+    path: InputPath, integers: tuple[str, ...], texts: tuple[str, ...], numbers: tuple[str, ...]
 ) -> dict[str, np.ndarray]:
     """Return columns of a feather file as int64, str objects or float64.
 
@@ -231,7 +232,7 @@ def _read_feather(
     return columns
 
 
-def _read_texts(path: Path, name: str, column: pa.ChunkedArray) -> np.ndarray:
+def _read_texts(path: InputPath, name: str, column: pa.ChunkedArray) -> np.ndarray:
     """Return texts (n,); equal texts are one object."""
     values = []
     for chunk in column.chunks:
@@ -252,7 +253,7 @@ def _is_text(kind: pa.DataType) -> bool:
     return pa.types.is_string(kind) or pa.types.is_large_string(kind)
 
 
-def _check_range(path: Path, name: str, values: np.ndarray, low: float, high: float) -> None:
+def _check_range(path: InputPath, name: str, values: np.ndarray, low: float, high: float) -> None:
     bad = np.flatnonzero((values < low) | (values > high))
     if len(bad):
         raise ValueError(
@@ -260,7 +261,7 @@ def _check_range(path: Path, name: str, values: np.ndarray, low: float, high: fl
         )
 
 
-def _check_quaternion(path: Path, columns: dict[str, np.ndarray]) -> None:
+def _check_quaternion(path: InputPath, columns: dict[str, np.ndarray]) -> None:
     for name in QUATERNION:
         _check_range(path, name, columns[name], -2, 2)
     norm = np.linalg.norm(_read_columns(columns, QUATERNION), axis=1)
@@ -293,7 +294,7 @@ def _hash_ids(track_uuid: np.ndarray) -> np.ndarray:
 # -------------------------------------------------------------------------------------------------------- map
 
 
-def _read_ground(folder: Path) -> MapGround:
+def _read_ground(folder: InputPath) -> MapGround:
     """Return the ground: drivable areas have class road, and pedestrian crossings have class crossing.
 
     Heights come from the log's raster.
@@ -311,21 +312,21 @@ def _read_ground(folder: Path) -> MapGround:
     )
 
 
-def _find_only_file(folder: Path, pattern: str) -> Path:
+def _find_only_file(folder: InputPath, pattern: str) -> InputPath:
     paths = sorted(folder.glob(pattern))
     if len(paths) != 1:
         raise ValueError(f"{folder / pattern}: {len(paths)} such files, expected 1; download the log again")
     return paths[0]
 
 
-def _read_json(path: Path) -> dict:
+def _read_json(path: InputPath) -> dict:
     content = read_json_file(path, AGAIN)
     if not isinstance(content, dict):
         raise ValueError(f"{path}: holds a {type(content).__name__}, expected an object; download the log again")
     return content
 
 
-def _read_section(path: Path, content: dict, name: str) -> list[dict]:
+def _read_section(path: InputPath, content: dict, name: str) -> list[dict]:
     """Return the entries of one section of the map file."""
     section = content.get(name)
     if not isinstance(section, dict) or not all(isinstance(entry, dict) for entry in section.values()):
@@ -333,7 +334,7 @@ def _read_section(path: Path, content: dict, name: str) -> list[dict]:
     return list(section.values())
 
 
-def _read_points(path: Path, entry: dict, name: str, least: int, most: int | None = None) -> np.ndarray:
+def _read_points(path: InputPath, entry: dict, name: str, least: int, most: int | None = None) -> np.ndarray:
     """Return x and y (n, 2) of the points in entry[name], in the city frame (m)."""
     points = entry.get(name)
     if not isinstance(points, list) or len(points) < least or (most is not None and len(points) > most):
@@ -359,12 +360,12 @@ def _read_quad(edge1_m: np.ndarray, edge2_m: np.ndarray) -> np.ndarray:
     return np.concatenate([edge1_m, edge2_m[::-1]])
 
 
-def _read_heights(path: Path) -> np.ndarray:
+def _read_heights(path: InputPath) -> np.ndarray:
     """Return the heights (rows, cols) in the city frame (m). NaN marks unknown heights."""
     _check_file(path)
     try:
         # Memory mapping avoids a large allocation if the shape in the header is wrong.
-        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+        mapped = np.load(find_local_file(path), mmap_mode="r", allow_pickle=False)
     # numpy evaluates the header as Python code. A broken header can therefore raise any error.
     except Exception as error:
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
@@ -383,7 +384,7 @@ def _read_heights(path: Path) -> np.ndarray:
     return height_m
 
 
-def _read_sim2(path: Path) -> np.ndarray:
+def _read_sim2(path: InputPath) -> np.ndarray:
     """Return raster_from_city (3, 3), which maps a city point (x, y, 1) to (column, row, 1): p = s (R p_city + t)."""
     content = _read_json(path)
     rotation, translation, scale = content.get("R"), content.get("t"), content.get("s")
@@ -402,6 +403,6 @@ def _read_sim2(path: Path) -> np.ndarray:
     return raster_from_city
 
 
-def _check_file(path: Path) -> None:
+def _check_file(path: InputPath) -> None:
     if not path.is_file():
         raise ValueError(f"{path} is missing; download the log again")

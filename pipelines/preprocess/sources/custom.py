@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from pathlib import Path
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,7 @@ from pipelines.preprocess.sources.custom_tables import (
 )
 from pipelines.preprocess.sources.drive import STATIC, Drive, SurfaceGround
 from pipelines.preprocess.sources.files import are_all_numbers, read_json_file
+from pipelines.preprocess.sources.input_paths import InputPath, make_input_path
 from pipelines.preprocess.sources.triangulation import triangulate_polygon
 from pipelines.schema.splits import TEST, TRAIN
 
@@ -76,7 +77,7 @@ SIGHT_M = 100.0
 # ----------------------------------------------------------------------------------------------------- the root
 
 
-def list_drives(root: str | Path) -> list[str]:
+def list_drives(root: str | PathLike) -> list[str]:
     """Return the drives.
 
     A drive is a folder with a name that does not begin with a dot.
@@ -90,7 +91,7 @@ def list_drives(root: str | Path) -> list[str]:
     Raises:
         ValueError: The directory holds no drive, or a name contains characters that a scene id cannot contain.
     """
-    names = sorted(path.name for path in Path(root).glob("*/") if not path.name.startswith("."))
+    names = sorted(path.name for path in make_input_path(root).glob("*/") if not path.name.startswith("."))
     if not names:
         raise ValueError(
             f"{root} holds no folder; --input must name the folder of all drives, which holds DRIVE/boxes.parquet,"
@@ -99,13 +100,13 @@ def list_drives(root: str | Path) -> list[str]:
     for name in names:
         if not re.fullmatch(r"[A-Za-z0-9._-]+", name):
             raise ValueError(
-                f"{Path(root, name)}: the name of a drive is part of file names; rename the folder with letters,"
-                " digits, '.', '_' and '-'"
+                f"{make_input_path(root, name)}: the name of a drive is part of file names; rename the folder with"
+                " letters, digits, '.', '_' and '-'"
             )
     return names
 
 
-def read_splits(root: str | Path) -> dict[str, str] | None:
+def read_splits(root: str | PathLike) -> dict[str, str] | None:
     """Read the split of every drive from ROOT/splits.json.
 
     Args:
@@ -118,7 +119,7 @@ def read_splits(root: str | Path) -> dict[str, str] | None:
         ValueError: The file is invalid, omits a drive, contains an unknown drive, or contains a split other than train
             and test.
     """
-    path = Path(root, "splits.json")
+    path = make_input_path(root, "splits.json")
     if not path.exists():
         return None
     sides = read_json_file(path, AGAIN)
@@ -140,7 +141,7 @@ def read_splits(root: str | Path) -> dict[str, str] | None:
     return sides
 
 
-def read_ground_classes(root: str | Path) -> tuple[str, ...]:
+def read_ground_classes(root: str | PathLike) -> tuple[str, ...]:
     """Return the ground classes of all drives.
 
     The function ignores unreadable polygon files, because `read_drive` raises an error for them.
@@ -157,7 +158,7 @@ def read_ground_classes(root: str | Path) -> tuple[str, ...]:
     found, errors = set(), []
     for name in list_drives(root):
         try:
-            found |= set(_read_polygons(Path(root, name)).texts("class"))
+            found |= set(_read_polygons(make_input_path(root, name)).texts("class"))
         except ValueError as error:
             errors.append(error)
     if not found:
@@ -165,7 +166,7 @@ def read_ground_classes(root: str | Path) -> tuple[str, ...]:
     return tuple(name for name in GROUND_CLASSES if name in found)
 
 
-def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = None) -> Drive:
+def read_drive(root: str | PathLike, name: str, classes: tuple[str, ...] | None = None) -> Drive:
     """Read all boxes, the ground and the poses of one drive.
 
     `timestamp` is the frame of a moving box, or STATIC. `instance_id` is the number in the file, or a hash of the text
@@ -183,7 +184,7 @@ def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = No
     Raises:
         ValueError: A value is missing or invalid; the message names file and row.
     """
-    folder = Path(root, name)
+    folder = make_input_path(root, name)
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such drive; the drives are {', '.join(list_drives(root))[:200]}")
     frame, world_from_ego = read_poses(root, name)
@@ -213,7 +214,7 @@ def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = No
 # ------------------------------------------------------------------------------------------------------- poses
 
 
-def read_poses(root: str | Path, name: str) -> tuple[np.ndarray, np.ndarray]:
+def read_poses(root: str | PathLike, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Read the poses of one drive.
 
     Args:
@@ -228,7 +229,7 @@ def read_poses(root: str | Path, name: str) -> tuple[np.ndarray, np.ndarray]:
         ValueError: The poses do not fit an upright vehicle, or they are not in driving order; the message names file
             and row.
     """
-    table = read_table(Path(root, name), "poses", POSE_COLUMNS, ("frame",))
+    table = read_table(make_input_path(root, name), "poses", POSE_COLUMNS, ("frame",))
     if not table.rows:
         raise ValueError(f"{table.path} holds no pose; every pose becomes a scene, so add at least one")
     frame = table.frames()
@@ -291,7 +292,7 @@ def _read_matrices(table: DriveTable) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------- boxes
 
 
-def _read_boxes(folder: Path) -> DriveTable:
+def _read_boxes(folder: InputPath) -> DriveTable:
     return read_table(folder, "boxes", BOX_COLUMNS, ("category", *PLACE, *SIZE))
 
 
@@ -338,7 +339,7 @@ def _make_instance_ids(table: DriveTable) -> np.ndarray:
     return np.array(ids, np.int64)
 
 
-def _check_in_sight(path: Path, points_m: np.ndarray, world_from_ego: np.ndarray) -> None:
+def _check_in_sight(path: InputPath, points_m: np.ndarray, world_from_ego: np.ndarray) -> None:
     """Raise ValueError if every pose is farther than SIGHT_M from the bounding box of the points (n, 3)."""
     if len(points_m) == 0:
         return
@@ -357,7 +358,7 @@ def _point(point_m: np.ndarray) -> str:
 # ------------------------------------------------------------------------------------------------------ ground
 
 
-def _read_polygons(folder: Path) -> DriveTable:
+def _read_polygons(folder: InputPath) -> DriveTable:
     table = read_table(folder, "polygons", POLYGON_COLUMNS, POLYGON_COLUMNS)
     table.texts("class", GROUND_CLASSES)
     return table
@@ -378,7 +379,7 @@ def _make_ground(table: DriveTable, classes: tuple[str, ...]) -> SurfaceGround:
     )
 
 
-def _triangulate_polygon(path: Path, row: int, outline_m: np.ndarray) -> np.ndarray:
+def _triangulate_polygon(path: InputPath, row: int, outline_m: np.ndarray) -> np.ndarray:
     """Return the triangles (t, 3, 3) of one outline in the world frame, from a constrained Delaunay triangulation."""
     reason = shapely.is_valid_reason(shapely.Polygon(outline_m[:, :2]))
     if reason != "Valid Geometry":
@@ -389,7 +390,7 @@ def _triangulate_polygon(path: Path, row: int, outline_m: np.ndarray) -> np.ndar
     return outline_m[triangulate_polygon(outline_m[:, :2] - outline_m[0, :2])]
 
 
-def _make_outline(path: Path, row: int, value: object) -> np.ndarray:
+def _make_outline(path: InputPath, row: int, value: object) -> np.ndarray:
     """Return the vertices (n, 3) float64 of an open outline, without repeated successive points."""
     if type(value) is not list:
         raise ValueError(f"{path}: outline of row {row} is {show_value(value)}, expected a list of points [x, y, z]")

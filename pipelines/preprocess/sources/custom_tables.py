@@ -8,7 +8,6 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from models.limits import LimitError, require_within
 from models.scene import make_yaw_rotation
 from pipelines.preprocess.sources.files import read_json_file
+from pipelines.preprocess.sources.input_paths import InputPath, find_local_file
 from pipelines.runtime.parquet_sizes import ITEM_BYTES, measure_columns
 
 pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
@@ -40,7 +40,7 @@ AGAIN = "write it again"
 class DriveTable:
     """The columns of a file as Python values. The methods check every value."""
 
-    path: Path
+    path: InputPath
     rows: int
     columns: dict[str, list | pa.ChunkedArray]  # Columns with at least one value.
 
@@ -166,7 +166,7 @@ class DriveTable:
         return list(self.iterate(name))
 
 
-def read_table(folder: Path, name: str, known: Sequence[str], required: Sequence[str]) -> DriveTable:
+def read_table(folder: InputPath, name: str, known: Sequence[str], required: Sequence[str]) -> DriveTable:
     """Read FOLDER/NAME.parquet or .json as a map from name to column, and check the names."""
     paths = [folder / f"{name}.parquet", folder / f"{name}.json"]
     found = [path for path in paths if path.is_file()]
@@ -189,7 +189,7 @@ def _has_values(column: list | pa.ChunkedArray) -> bool:
     return column.null_count < len(column)
 
 
-def _check_names(path: Path, names: Sequence[str], known: Sequence[str]) -> None:
+def _check_names(path: InputPath, names: Sequence[str], known: Sequence[str]) -> None:
     """Raise ValueError if a column is unknown or occurs twice."""
     for name in names:
         if name not in known and name != PANDAS_INDEX:
@@ -202,16 +202,17 @@ def _check_names(path: Path, names: Sequence[str], known: Sequence[str]) -> None
         raise ValueError(f"{path}: column {show_value(twice[0])} occurs twice; drop one of them")
 
 
-def _load_parquet(path: Path, known: Sequence[str]) -> tuple[int, dict[str, list | pa.ChunkedArray]]:
+def _load_parquet(path: InputPath, known: Sequence[str]) -> tuple[int, dict[str, list | pa.ChunkedArray]]:
     """Read a Parquet file after a check of its columns and of the memory that they need.
 
     Texts are read as dictionaries, which hold each different text once. The schema and the sizes are those that the
     file states.
     """
+    local = find_local_file(path)
     try:
-        with open(path, "rb") as stream:
+        with open(local, "rb") as stream:
             rows, sizes = measure_columns(stream)
-        schema = pq.read_schema(path)
+        schema = pq.read_schema(local)
     except Exception as error:  # A damaged file makes pyarrow raise errors of many types.
         raise _make_parquet_error(path, error) from error
     _check_names(path, schema.names, known)
@@ -225,7 +226,7 @@ def _load_parquet(path: Path, known: Sequence[str]) -> tuple[int, dict[str, list
     require_within("table_bytes", sum(size.bytes + ITEM_BYTES * size.values for size in sizes), str(path))
     texts = [field.name for field in schema if _is_text_kind(field.type)]
     try:
-        with pq.ParquetFile(path, read_dictionary=texts) as file:
+        with pq.ParquetFile(local, read_dictionary=texts) as file:
             table = file.read()
         table.validate(full=True)
         if len(table) != rows:
@@ -239,7 +240,7 @@ def _load_parquet(path: Path, known: Sequence[str]) -> tuple[int, dict[str, list
     return len(table), dict(zip(table.column_names, table.columns, strict=True))
 
 
-def _make_parquet_error(path: Path, error: Exception) -> ValueError:
+def _make_parquet_error(path: InputPath, error: Exception) -> ValueError:
     reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
     return ValueError(f"{path}: broken Parquet file ({reason}); write it again")
 
@@ -265,7 +266,7 @@ def _is_plain(kind: pa.DataType) -> bool:
     return _is_number(kind) or _is_text_kind(kind) or pa.types.is_boolean(kind) or pa.types.is_null(kind)
 
 
-def _check_column_sizes(path: Path, name: str, column: pa.ChunkedArray) -> None:
+def _check_column_sizes(path: InputPath, name: str, column: pa.ChunkedArray) -> None:
     """Raise LimitError if a text, a list or all lists of a column are too long for Python objects."""
     for chunk in column.chunks:
         if pa.types.is_dictionary(chunk.type) and len(chunk.dictionary):
@@ -284,7 +285,7 @@ def _check_column_sizes(path: Path, name: str, column: pa.ChunkedArray) -> None:
                     raise ValueError(f"column {name} has a point of {longest} numbers")
 
 
-def _load_records(path: Path, known: Sequence[str]) -> tuple[int, dict[str, list | pa.ChunkedArray]]:
+def _load_records(path: InputPath, known: Sequence[str]) -> tuple[int, dict[str, list | pa.ChunkedArray]]:
     records = read_json_file(path, AGAIN)
     if not isinstance(records, list):
         raise ValueError(f"{path} holds a {type(records).__name__}, expected a list of objects, one per row")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from models.limits import LimitError, require_within
 from models.strict_json import parse_json
+from pipelines.preprocess.sources.input_paths import InputPath, find_local_file
 
 
-def read_file(path: Path, remedy: str) -> bytes:
+def read_file(path: InputPath, remedy: str) -> bytes:
     """Read a regular file that has at most json_bytes bytes.
 
     Args:
@@ -25,13 +25,14 @@ def read_file(path: Path, remedy: str) -> bytes:
     try:
         if not path.is_file():  # Reading a named pipe would never end.
             raise ValueError(f"{path} is missing or no regular file; {remedy}")
-        require_within("json_bytes", path.stat().st_size, str(path))
-        return path.read_bytes()
+        local = find_local_file(path)
+        require_within("json_bytes", local.stat().st_size, str(path))
+        return local.read_bytes()
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror}); {remedy}") from error
 
 
-def read_json_file(path: Path, remedy: str) -> Any:
+def read_json_file(path: InputPath, remedy: str) -> Any:
     """Read a JSON file. NaN and Infinity are kept, so that the caller can name their row.
 
     Args:

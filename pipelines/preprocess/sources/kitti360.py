@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
+from os import PathLike
 from typing import BinaryIO
 
 import numpy as np
@@ -26,6 +26,7 @@ from models.limits import LimitError, require_within
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES
 from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
 from pipelines.preprocess.sources.files import read_file
+from pipelines.preprocess.sources.input_paths import InputPath, find_local_file, make_input_path
 
 SOURCE = "kitti360"
 
@@ -147,7 +148,7 @@ class ReadReport:
         return "; ".join(parts)
 
 
-def list_sequences(root: str | Path) -> list[str]:
+def list_sequences(root: str | PathLike) -> list[str]:
     """Return the annotated sequences.
 
     A sequence without poses is included; `read_poses` raises an error for it.
@@ -161,7 +162,7 @@ def list_sequences(root: str | Path) -> list[str]:
     Raises:
         ValueError: No sequence exists, or no sequence has poses.
     """
-    folder = Path(root) / "data_3d_bboxes" / "train_full"
+    folder = make_input_path(root, "data_3d_bboxes", "train_full")
     names = sorted(match[1] for path in folder.glob("*.xml") if (match := SEQUENCE_NAME.fullmatch(path.stem)))
     if not names:
         raise ValueError(
@@ -176,7 +177,7 @@ def list_sequences(root: str | Path) -> list[str]:
     return names
 
 
-def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
+def read_drive(root: str | PathLike, sequence: str) -> tuple[Drive, ReadReport]:
     """Read all annotations along one sequence.
 
     For a moving object, `instance_id` is the track number (dynamicSeq). For a static object, it is the index in the
@@ -206,7 +207,7 @@ def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
     return drive, report
 
 
-def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
+def _read_objects(path: InputPath) -> tuple[list[_Box], list[_Slab], ReadReport]:
     """Return the boxes and slabs of one XML file, and a report on dropped objects.
 
     Boxes and slabs have the order of the file. Duplicates are dropped.
@@ -261,15 +262,15 @@ def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
 # ------------------------------------------------------------------------------------------------------ poses
 
 
-def _make_boxes_path(root: str | Path, sequence: str) -> Path:
-    return Path(root) / "data_3d_bboxes" / "train_full" / f"2013_05_28_drive_{sequence}_sync.xml"
+def _make_boxes_path(root: str | PathLike, sequence: str) -> InputPath:
+    return make_input_path(root, "data_3d_bboxes", "train_full") / f"2013_05_28_drive_{sequence}_sync.xml"
 
 
-def _make_poses_path(root: str | Path, sequence: str) -> Path:
-    return Path(root) / "data_poses" / f"2013_05_28_drive_{sequence}_sync" / "poses.txt"
+def _make_poses_path(root: str | PathLike, sequence: str) -> InputPath:
+    return make_input_path(root, "data_poses") / f"2013_05_28_drive_{sequence}_sync" / "poses.txt"
 
 
-def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]:
+def read_poses(root: str | PathLike, sequence: str) -> tuple[np.ndarray, np.ndarray]:
     """Read the poses of one sequence.
 
     The file omits frames in which the car hardly moves.
@@ -342,7 +343,7 @@ class _BoundedStream:
         return part
 
 
-def _stream_objects(path: Path) -> Iterator[dict]:
+def _stream_objects(path: InputPath) -> Iterator[dict]:
     """Yield the fields of each <objectN> as a map from tag to element, and free the previous elements.
 
     The function raises ValueError for a missing or malformed file. The function also rejects files with a document type
@@ -350,10 +351,11 @@ def _stream_objects(path: Path) -> Iterator[dict]:
     """
     again = "unpack data_3d_bboxes.zip of KITTI-360 again"
     try:
-        if path.exists() and not path.is_file():  # Reading a named pipe would never end.
+        local = find_local_file(path)
+        if local.exists() and not local.is_file():  # Reading a named pipe would never end.
             raise ValueError("no regular file")
-        with open(path, "rb") as file:
-            require_within("json_bytes", path.stat().st_size)
+        with open(local, "rb") as file:
+            require_within("json_bytes", local.stat().st_size)
             depth = elements = 0
             for event, element in ElementTree.iterparse(_BoundedStream(file), ("start", "end"), forbid_dtd=True):
                 depth += 1 if event == "start" else -1

@@ -1,0 +1,151 @@
+"""Prepare the output of a job: start Ray, check that all nodes share the storage, and ensure that no other job writes.
+
+Each job enters `hold_output` before its first write.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from jobs.support.cli import home_path
+from jobs.support.ray_session import start_ray
+from models.uris import split_name
+from pipelines.runtime.shared_storage import require_shared_storage
+from pipelines.schema.lease import LIFETIME_S, IfBusy, Lease, Owner
+
+LIFETIME_VARIABLE = "PRITTI_LEASE_SECONDS"
+JOB_VARIABLE = "RAY_JOB_CONFIG_JSON_ENV_VAR"  # Ray sets this variable in submitted jobs.
+
+
+class JobStopped(KeyboardInterrupt):
+    """Raised in the main thread by SIGTERM (`ray job stop`) or by the loss of a lease; the message is the reason."""
+
+
+def find_job_id() -> str:
+    """Return the submission id of this Ray job, or "" if the process was not submitted as a job."""
+    try:
+        return json.loads(os.environ.get(JOB_VARIABLE, "{}"))["metadata"]["job_submission_id"]
+    except (ValueError, KeyError, TypeError):
+        return ""
+
+
+def find_lifetime_s() -> float:
+    """Return $PRITTI_LEASE_SECONDS, the time after which the lease of a silent job expires.
+
+    Raises:
+        ValueError: The variable is not a positive number.
+    """
+    text = os.environ.get(LIFETIME_VARIABLE, "")
+    try:
+        seconds = float(text or LIFETIME_S)
+    except ValueError:
+        seconds = 0.0
+    if not seconds > 0:
+        raise ValueError(f"{LIFETIME_VARIABLE} is {text!r}, expected a number of seconds greater than 0")
+    return seconds
+
+
+@contextmanager
+def stop_on_sigterm() -> Iterator[None]:
+    """Raise JobStopped in the main thread when SIGTERM arrives. In other threads, this function does nothing."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        raise JobStopped(_reasons.pop() if _reasons else "the job was stopped (SIGTERM)")
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+_reasons: list[str] = []  # Reason for a SIGTERM that this process sends to itself.
+
+
+def _stop_job(message: str) -> None:
+    """Stop this job from the thread of a lease."""
+    _reasons.append(message)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+@contextmanager
+def hold_lease(output: str, name: str, if_busy: IfBusy = "refuse") -> Iterator[None]:
+    """Hold the right to write to an output while the body runs. Ray is not needed.
+
+    Args:
+        output: Directory or URI to which this job and its tasks write.
+        name: Name of the run or table that is written. Jobs with other names may write to the same output.
+        if_busy: Behaviour if another job writes to the same output (`Lease.acquire`).
+
+    Yields:
+        None.
+
+    Raises:
+        ValueError: Another job writes to the output.
+        OSError: The output cannot be written.
+    """
+    with stop_on_sigterm():
+        lease = Lease(output, name, Owner.of_this_process(find_job_id()), _stop_job, find_lifetime_s())
+        lease.acquire(if_busy, lambda line: print(line, flush=True))
+        state = "failed"
+        try:
+            yield
+            state = "finished"
+        except KeyboardInterrupt:
+            state = "killed"
+            raise
+        finally:
+            lease.release(state)
+
+
+@contextmanager
+def hold_output(output: str, name: str, if_busy: IfBusy = "refuse", training: bool = False) -> Iterator[None]:
+    """Start Ray, check that all nodes share an output, and hold the right to write to it while the body runs.
+
+    Args:
+        output: Directory or URI to which this job and its tasks write.
+        name: Name of the run or table that is written (`hold_lease`).
+        if_busy: Behaviour if another job writes to the same output (`Lease.acquire`).
+        training: Start Ray with a dashboard (`start_ray`).
+
+    Yields:
+        None.
+
+    Raises:
+        ValueError: The output is not shared by all nodes, or another job writes to it.
+        OSError: The output cannot be written.
+    """
+    start_ray(training)
+    with stop_on_sigterm():
+        require_shared_storage(output)
+        with hold_lease(output, name, if_busy):
+            yield
+
+
+@contextmanager
+def hold_training(name: str, output: str, if_busy: IfBusy = "refuse") -> Iterator[None]:
+    """Hold the right to train a run and to write its model while the body runs.
+
+    Args:
+        name: Name of the run; its checkpoints are in $PRITTI_HOME/runs/<name>.
+        output: Directory or URI of the model. Its lease is next to it, because the directory is published.
+        if_busy: Behaviour if another job trains this run or writes this model (`Lease.acquire`).
+
+    Yields:
+        None.
+
+    Raises:
+        ValueError: An output is not shared by all nodes, or another job writes to it.
+        OSError: An output cannot be written.
+    """
+    with hold_output(home_path("runs"), name, if_busy, training=True), hold_lease(*split_name(output), if_busy):
+        yield

@@ -1,0 +1,217 @@
+"""Tests of jobs whose inputs and outputs are in object storage (an S3 server of moto)."""
+
+import json
+import os
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pyarrow.fs as pafs
+import pyarrow.parquet as pq
+import pytest
+from helpers import small_spec, tiny_pipeline
+from s3_server import S3Server, run_s3_server
+
+from models.local_copy import make_local_copy
+from models.pipeline import PrITTIPipeline
+from models.uris import join_uri, resolve_uri
+from pipelines.preprocess import ingest
+from pipelines.preprocess.sharding import plan_argoverse2, plan_custom, plan_kitti360, plan_town
+from pipelines.runtime import storage
+from pipelines.schema.tables import find_shards
+
+
+@pytest.fixture(scope="module")
+def s3(cluster) -> Iterator[S3Server]:
+    with run_s3_server() as server:
+        yield server
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch) -> Path:
+    """An empty local cache."""
+    monkeypatch.setenv("PRITTI_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def upload(directory: Path, uri: str) -> str:
+    file_system, path = resolve_uri(uri)
+    pafs.copy_files(str(directory), path, destination_filesystem=file_system)
+    return uri
+
+
+def read_tables(root: str) -> dict[str, object]:
+    """Return the content of all Parquet files and of dataset.json, by relative path."""
+    file_system, path = resolve_uri(root)
+    found = file_system.get_file_info(pafs.FileSelector(path, recursive=True))
+    names = {info.path[len(path) + 1 :]: info.path for info in found if info.is_file}
+    assert not [name for name in names if name.startswith(".staging") or "/.tmp-" in name]
+    kept = {name: place for name, place in names.items() if not name.startswith(".")}
+    return {
+        name: pq.read_table(place, filesystem=file_system, partitioning=None)
+        if name.endswith(".parquet")
+        else file_system.open_input_stream(place).read()
+        for name, place in kept.items()
+    }
+
+
+def test_town_in_s3_equals_local_town(s3, tmp_path):
+    tasks, options = plan_town(24, 8, 0), {"source": "town"}
+    s3.requests.clear()
+    ingest.ingest_drives(tasks, s3.uri("town"), options)
+    writes = s3.list_writes()
+    ingest.ingest_drives(tasks, str(tmp_path / "town"), options)
+    local = read_tables(str(tmp_path / "town"))
+    assert len(local) >= 10 and read_tables(s3.uri("town")) == local
+    # Staged scenes, manifests and options are files, too. Each file is written once.
+    assert len(writes) <= 1.5 * len(set(writes)) and len(writes) <= 2 * len(local)
+    s3.requests.clear()
+    assert ingest.ingest_drives(tasks, s3.uri("town"), options).already_complete
+    assert not s3.list_writes()
+
+
+@pytest.mark.parametrize("source", ["kitti360", "av2", "own"])
+def test_raw_drives_in_s3_equal_local_drives(s3, request, source, cache, tmp_path):
+    plan = {
+        "kitti360": lambda root: plan_kitti360(root),
+        "av2": plan_argoverse2,
+        "own": lambda root: plan_custom(root, split=False),
+    }[source]
+    raw = write_own_drive(tmp_path / "raw") if source == "own" else request.getfixturevalue("real_data") / source
+    made, options = {}, {"source": source}
+    for name, root in (("local", str(raw)), ("s3", upload(raw, s3.uri("raw", source)))):
+        ingest.ingest_drives(plan(root)[:2], str(tmp_path / name), options)
+        made[name] = read_tables(str(tmp_path / name))
+    assert len(made["local"]) >= 4 and made["s3"] == made["local"]
+
+
+def write_own_drive(root: Path) -> Path:
+    """Write a drive of two poses with one box and one road as JSON files."""
+    box = {"category": "pole", "x_m": 5.0, "y_m": 1.0, "z_m": 1.0, "yaw_rad": 0.0, "frame": None}
+    box |= {"length_m": 0.5, "width_m": 0.5, "height_m": 4.0}
+    road = {"class": "road", "outline": [[-9.0, -4.0, 0.0], [80.0, -4.0, 0.0], [80.0, 4.0, 0.0], [-9.0, 4.0, 0.0]]}
+    poses = [{"frame": k, "x_m": float(k), "y_m": 0.0, "z_m": 0.0, "yaw_rad": 0.0} for k in range(2)]
+    (root / "drive").mkdir(parents=True)
+    for name, rows in {"boxes": [box], "polygons": [road], "poses": poses}.items():
+        (root / "drive" / f"{name}.json").write_text(json.dumps(rows))
+    return root
+
+
+def test_raw_drive_error_names_the_uri(s3, real_data, cache, tmp_path):
+    copy = tmp_path / "raw"
+    shutil.copytree(real_data / "kitti360", copy)
+    (poses,) = copy.glob("data_poses/*/poses.txt")
+    poses.write_text("1 2 3\n")
+    given = upload(copy, s3.uri("damaged"))
+    with pytest.raises(ValueError, match=r"s3://tests/damaged/data_poses/.*poses.txt.*, line 1: 3 numbers"):
+        plan_kitti360(given, split=False)
+
+
+def test_pipeline_loads_from_uri_without_other_files(s3, cache, tmp_path):
+    pipeline = tiny_pipeline(small_spec())
+    pipeline.save_pretrained(tmp_path / "model")
+    (tmp_path / "model" / "notes.bin").write_bytes(b"x" * 1000)
+    uri = upload(tmp_path / "model", s3.uri("model"))
+    s3.requests.clear()
+    loaded = PrITTIPipeline.from_pretrained(uri)
+    assert all((loaded.dit.state_dict()[k] == v).all() for k, v in pipeline.dit.state_dict().items())
+    read = [path for method, path, _ in s3.requests if method == "GET" and path != "/tests"]
+    assert read and not any(path.endswith("notes.bin") for path in read)
+    s3.requests.clear()
+    PrITTIPipeline.from_pretrained(uri)
+    assert not [path for method, path, _ in s3.requests if method == "GET" and path != "/tests"]
+
+
+def test_local_copy_follows_source_and_repairs_damage(s3, cache):
+    uri = s3.uri("copied", "a.bin")
+    storage.write_whole(uri, lambda stream: stream.write(b"first"))
+    copy = Path(make_local_copy(uri))
+    assert copy.read_bytes() == b"first" and copy.is_relative_to(cache) and copy.name == "a.bin"
+    copy.write_bytes(b"flipt")
+    from models import local_copy
+
+    local_copy._checked.clear()  # as in a new process
+    assert Path(make_local_copy(uri)).read_bytes() == b"first"
+    time.sleep(1.1)  # modification times of S3 have seconds
+    storage.write_whole(uri, lambda stream: stream.write(b"other"))
+    assert Path(make_local_copy(uri)).read_bytes() == b"other"
+    with pytest.raises(ValueError, match=r"s3://tests/copied/absent.*: no such file or directory"):
+        make_local_copy(s3.uri("copied", "absent"))
+
+
+def test_local_copy_is_shared_by_concurrent_callers(s3, cache):
+    uri = s3.uri("copied", "b.bin")
+    content = os.urandom(3_000_000)
+    storage.write_whole(uri, lambda stream: stream.write(content))
+    found: list[str] = []
+    threads = [threading.Thread(target=lambda: found.append(make_local_copy(uri))) for _ in range(8)]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+    assert len(set(found)) == 1 and Path(found[0]).read_bytes() == content
+    assert not list(cache.rglob(".tmp-*"))
+
+
+def test_failed_write_sends_nothing(s3):
+    def write(stream) -> None:
+        stream.write(b"half")
+        raise RuntimeError("stop")
+
+    s3.requests.clear()
+    with pytest.raises(RuntimeError, match="stop"):
+        storage.write_whole(s3.uri("failed", "x"), write)
+    assert not s3.list_writes() and not storage.exists(s3.uri("failed", "x"))
+
+
+def test_small_and_large_files_are_written_whole(s3):
+    for size in (0, 10, 20_000_000):
+        content = os.urandom(size)
+        s3.requests.clear()
+        storage.write_whole(s3.uri("sizes", str(size)), lambda stream, content=content: stream.write(content))
+        assert len(s3.list_writes()) == (1 if size < 10**7 else len(s3.list_writes()))
+        assert storage.read_bytes(s3.uri("sizes", str(size))) == content
+
+
+def test_create_file_has_one_winner(s3):
+    wins: list[bool] = []
+    uri = s3.uri("race", "record")
+    threads = [threading.Thread(target=lambda k=k: wins.append(storage.create_file(uri, b"%d" % k))) for k in range(8)]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+    assert sorted(wins) == [False] * 7 + [True]
+
+
+@pytest.mark.parametrize(
+    ("uri", "message"),
+    [
+        ("s3://absent-bucket/x", r"s3://absent-bucket/x.*: cannot be written .*"),
+        ("s3://tests/x", r"s3://tests/x.*: cannot be written .*"),
+    ],
+)
+def test_refused_write_is_one_clear_error(s3, uri, message, monkeypatch):
+    if "absent" not in uri:
+        s3.intercept = lambda method, path: 403 if method == "PUT" else 0
+    options = s3.uri().partition("?")[2]
+    try:
+        with pytest.raises(OSError, match=message):
+            storage.write_text("x", f"{uri}?{options}")
+    finally:
+        s3.intercept = lambda method, path: 0
+
+
+@pytest.mark.slow  # The connection times out after half a minute.
+def test_hung_endpoint_ends_with_an_error(s3):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        uri = f"s3://tests/x?endpoint_override=http://127.0.0.1:{server.getsockname()[1]}&region=x"
+        started = time.monotonic()
+        with pytest.raises((OSError, ValueError), match="s3://tests/x"):
+            storage.write_text("x", uri)
+    assert time.monotonic() - started < 60
+
+
+def test_missing_bucket_is_named_when_scenes_are_read(s3):
+    root = join_uri("s3://absent-bucket/town?" + s3.uri().partition("?")[2])
+    with pytest.raises(ValueError, match="s3://absent-bucket/town/scenes"):
+        find_shards(root)

@@ -1,0 +1,119 @@
+"""Tests of leases: an output has one writer, also if a writer was killed or clocks differ."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipelines.runtime import machines
+from pipelines.schema.lease import Lease, LeaseError, Owner
+
+ELSEWHERE = {"machine": "0" * 12, "host": "other"}
+
+
+def make_lease(output: Path, job: str, lifetime_s: float = 60.0, lost: list[str] | None = None, **changes) -> Lease:
+    owner = replace(Owner.of_this_process(job), **changes)
+    return Lease(str(output), "run", owner, (lost if lost is not None else []).append, lifetime_s)
+
+
+def test_second_writer_is_refused_with_the_job_of_the_first(tmp_path):
+    first = make_lease(tmp_path, "job-1")
+    first.acquire()
+    with pytest.raises(LeaseError, match=r"job job-1 on .* writes 'run' here.*--if-busy wait"):
+        make_lease(tmp_path, "job-2").acquire()
+    Lease(str(tmp_path), "another run", Owner.of_this_process("job-3"), print).acquire()
+    first.release("finished")
+    second = make_lease(tmp_path, "job-2")
+    second.acquire()
+    second.release("finished")
+    assert second.number == 2
+
+
+def test_of_many_concurrent_writers_one_acquires(tmp_path):
+    outcomes: list[str] = []
+
+    def acquire(number: int) -> None:
+        try:
+            make_lease(tmp_path, f"job-{number}", **ELSEWHERE).acquire()
+            outcomes.append("acquired")
+        except LeaseError:
+            outcomes.append("refused")
+
+    threads = [threading.Thread(target=acquire, args=(k,)) for k in range(16)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert outcomes.count("acquired") == 1 and outcomes.count("refused") == 15
+
+
+@pytest.mark.parametrize("state", ["finished", "failed"])
+@pytest.mark.parametrize("if_busy", ["wait", "join"])
+def test_waiting_writer_continues_when_the_first_ends(tmp_path, if_busy, state):
+    first, second, lines = make_lease(tmp_path, "job-1", 3.0), make_lease(tmp_path, "job-2", 3.0), []
+    first.acquire()
+    timer = threading.Timer(0.7, first.release, [state])
+    timer.start()
+    if (if_busy, state) == ("join", "failed"):
+        with pytest.raises(LeaseError, match=r"job job-1 .*did not finish \(failed\); run the same command again"):
+            second.acquire(if_busy, lines.append)
+    else:
+        second.acquire(if_busy, lines.append)
+        second.release("finished")
+    timer.join()
+    assert len(lines) == 1 and "waiting for job job-1" in lines[0]
+
+
+def test_killed_writer_of_this_machine_is_replaced_immediately(tmp_path):
+    code = (
+        "import os, sys; from pipelines.schema.lease import Lease, Owner;"
+        "Lease(sys.argv[1], 'run', Owner.of_this_process('killed'), print).acquire(); os.kill(os.getpid(), 9)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)])
+    assert done.returncode == -9
+    with_lease = make_lease(tmp_path, "job-2")
+    with_lease.acquire()
+    with_lease.release("finished")
+
+
+def test_silent_writer_of_another_machine_expires_by_storage_clock(tmp_path, monkeypatch):
+    """The clocks of the two machines differ by an hour."""
+    lost: list[str] = []
+    silent = make_lease(tmp_path, "job-1", 0.6, lost, **ELSEWHERE)
+    silent._keep = lambda: None
+    silent.acquire()
+    monkeypatch.setattr(time, "time", lambda: 3600.0)
+    other = make_lease(tmp_path, "job-2", 0.6)
+    with pytest.raises(LeaseError):
+        other.acquire()
+    time.sleep(0.8)
+    other.acquire()
+    assert "job job-2" in silent._beat()  # The silent writer notices its successor.
+    silent.release("finished")
+    with pytest.raises(LeaseError, match="job job-2"):
+        make_lease(tmp_path, "job-3").acquire()
+    other.release("finished")
+
+
+def test_heartbeat_keeps_the_lease_and_reports_its_loss(tmp_path):
+    lost: list[str] = []
+    lease = make_lease(tmp_path, "job-1", 0.6, lost, **ELSEWHERE)
+    lease.acquire()
+    time.sleep(1.2)
+    with pytest.raises(LeaseError, match="job job-1"):
+        make_lease(tmp_path, "job-2").acquire()
+    assert make_lease(tmp_path, "job-2", **ELSEWHERE)._create(2)  # as if it had seen an expired lease
+    time.sleep(0.4)
+    assert len(lost) == 1 and "job-2" in lost[0]
+    lease.release("killed")
+
+
+def test_process_ids_are_recognised_after_reuse():
+    assert machines.is_process_alive(os.getpid(), machines.find_start_time(os.getpid()))
+    assert not machines.is_process_alive(os.getpid(), "1")
+    assert not machines.is_process_alive(2**31 - 1)
