@@ -81,7 +81,7 @@ def test_killed_writer_of_this_machine_is_replaced_immediately(tmp_path):
     with_lease.release("finished")
 
 
-def test_silent_writer_of_another_machine_expires_by_storage_clock(tmp_path, monkeypatch):
+def test_silent_writer_expires_by_the_clock_of_storage(tmp_path, monkeypatch):
     """The clocks of the two machines differ by an hour."""
     lost: list[str] = []
     silent = make_lease(tmp_path, "job-1", 0.6, lost, **ELSEWHERE)
