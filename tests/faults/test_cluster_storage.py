@@ -73,7 +73,7 @@ def test_output_that_nodes_do_not_share_stops_the_job(tmp_path_factory):
         lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
         assert done.returncode == 2 and len(lines) == 1, done.stdout[-2000:] + done.stderr[-3000:]
         assert re.search(
-            rf"node \S+ \(127\.0\.0\.1, \w+\) does not share {output}/town with the driver: .*"
+            rf"node \S+ \([\d.]+, \w+\) does not share {output}/town with the driver: .*"
             r"use a directory that all nodes mount, such as NFS, or object storage \(s3://bucket/...\)",
             lines[0],
         )
