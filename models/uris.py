@@ -115,12 +115,16 @@ def resolve_uri(uri: str | os.PathLike) -> tuple[Any, str]:
             " logs and records; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY instead"
         )
     if parts.scheme == "s3":
-        environment = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
-        return connect_s3(parts.netloc, parts.query, environment), (parts.netloc + parts.path).rstrip("/")
+        return connect_s3(parts.netloc, parts.query, _find_endpoint()), (parts.netloc + parts.path).rstrip("/")
     try:
         return pafs.FileSystem.from_uri(uri)
     except (ValueError, NotImplementedError) as error:
         raise ValueError(f"{uri}: cannot be used ({error}); use a path or s3://, gs:// or abfss://") from error
+
+
+def _find_endpoint() -> str:
+    """Return the endpoint that the environment states, or ""."""
+    return os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
 
 
 @lru_cache(maxsize=64)
@@ -195,8 +199,7 @@ def connect_fsspec(uri: str) -> Any:
     parts = urlsplit(uri)
     arguments: dict[str, Any] = {}
     if parts.scheme == "s3":
-        environment = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
-        options = parse_s3_options(parts.query, environment)
+        options = parse_s3_options(parts.query, _find_endpoint())
         client = {"region_name": options.get("region")}
         if endpoint := options.get("endpoint_override"):
             client["endpoint_url"] = f"{options.get('scheme', 'https')}://{endpoint}"

@@ -10,7 +10,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 from jobs.support.cli import home_path
@@ -104,7 +104,8 @@ def hold_lease(output: str, name: str, if_busy: IfBusy = "refuse") -> Iterator[N
             state = "killed"
             raise
         finally:
-            lease.release(state)
+            with suppress(OSError):  # If the storage fails, the error of the body counts, and the lease expires.
+                lease.release(state)
 
 
 @contextmanager
@@ -125,10 +126,9 @@ def hold_output(output: str, name: str, if_busy: IfBusy = "refuse", training: bo
         OSError: The output cannot be written.
     """
     start_ray(training)
-    with stop_on_sigterm():
-        require_shared_storage(output)
-        with hold_lease(output, name, if_busy):
-            yield
+    require_shared_storage(output)
+    with hold_lease(output, name, if_busy):
+        yield
 
 
 @contextmanager

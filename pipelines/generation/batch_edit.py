@@ -110,25 +110,26 @@ def write_edited(row: dict, request: EditRequest, parts: list[tuple[Shard, list[
     """
     given, rows = parts[row["shard"]]
     shard = request.shard(row["shard"], given)
-    if not row["is_written"]:
-        scenes, done, rejects = [], [EDITS.empty_table()], []
-        for scene in given.scenes(rows):
-            try:
-                after, changes = edit_shard(scene, request)
-                scenes.append(after)
-                done += changes
-            except ValueError as error:
-                about = {"scene_id": scene.scene_id, "sequence": scene.sequence, "frame": scene.frame}
-                rejects.append(about | {"reason": str(error)})
-        if rejects:
-            storage.write_parquet(make_rejects_table(rejects), shard.path("rejects"))
-        if scenes:
-            shard.write(scenes)
-        # The edits table is written last and marks the shard as complete.
-        storage.write_parquet(pa.concat_tables(done), shard.path("edits"))
-        return {"shard": row["shard"], "scenes": len(rows), "rejects": len(rejects)}
-    rejected = len(shard.read("rejects", ["reason"])) if row["has_rejects"] else 0
-    return {"shard": row["shard"], "scenes": len(rows), "rejects": rejected}
+    if row["is_written"]:
+        rejected = len(shard.read("rejects", ["reason"])) if row["has_rejects"] else 0
+        if rejected == len(rows) or not shard.find_fault(len(rows) - rejected):
+            return {"shard": row["shard"], "scenes": len(rows), "rejects": rejected}
+    scenes, done, rejects = [], [EDITS.empty_table()], []
+    for scene in given.scenes(rows):
+        try:
+            after, changes = edit_shard(scene, request)
+            scenes.append(after)
+            done += changes
+        except ValueError as error:
+            about = {"scene_id": scene.scene_id, "sequence": scene.sequence, "frame": scene.frame}
+            rejects.append(about | {"reason": str(error)})
+    if rejects:
+        storage.write_parquet(make_rejects_table(rejects), shard.path("rejects"))
+    if scenes:
+        shard.write(scenes)
+    # The edits table is written last and marks the shard as complete.
+    storage.write_parquet(pa.concat_tables(done), shard.path("edits"))
+    return {"shard": row["shard"], "scenes": len(rows), "rejects": len(rejects)}
 
 
 @dataclass(frozen=True)

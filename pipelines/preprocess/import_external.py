@@ -27,7 +27,7 @@ from pipelines.runtime import storage
 from pipelines.runtime.npz import open_npz
 from pipelines.runtime.ray_tasks import map_rows
 from pipelines.schema.axis_convention import Axes
-from pipelines.schema.tables import Shard, make_rejects_table, make_scene_tables, require_written
+from pipelines.schema.tables import Shard, find_faults, make_rejects_table, make_scene_tables, require_written
 from pipelines.schema.validation import validate_table
 
 MAX_FILES_PER_SHARD = 64
@@ -223,7 +223,7 @@ def write_tables(row: dict, request: ImportRequest) -> dict:
             raise ValueError(f"{uri}: {error}") from error
         return made
 
-    if shard.is_written() and not storage.exists(shard.path("rejects")):
+    if not shard.find_fault() and not storage.exists(shard.path("rejects")):
         return {"shard": row["shard"], "scenes": shard.read("scenes", ["scene_id"])["scene_id"].to_pylist()}
     names, parts = read_files(request, shard, tables)
     for table, content in join_tables(parts).items() if parts else ():
@@ -301,8 +301,9 @@ def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None 
                 f"{request.output} holds an import {request.name!r} with other {' and '.join(differing)}; choose"
                 " another --name or --output"
             )
-        there = storage.exists(request.target) if request.kind == "npz" else all(shard.is_written() for shard in shards)
-        if made.get("rejects") == 0 and there:
+        promised = {shard: len(list(request.files_of(shard))) for shard in shards}
+        is_written = storage.exists(request.target) if request.kind == "npz" else not find_faults(promised)
+        if made.get("rejects") == 0 and is_written:
             return made
     storage.write_json(options, record)
     write = {"glb": write_tables, "npz": write_pictures}[request.kind]

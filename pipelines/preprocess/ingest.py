@@ -13,21 +13,21 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, dataclass
 
 import ray
 import ray.data
 
 from models.scene import Grid
-from pipelines.preprocess.shard_writer import make_manifest_path, read_drive, write_shard
+from pipelines.preprocess.shard_writer import list_promised_rows, make_manifest_path, read_drive, write_shard
 from pipelines.preprocess.sharding import ShardTask
 from pipelines.preprocess.sources.drive import Drive
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import MAX_RETRIES, map_rows
 from pipelines.schema.dataset import DESCRIPTION, Statistics, compute_training_statistics, label_scenes
 from pipelines.schema.run_guard import compare_options
-from pipelines.schema.tables import SCENE_TABLES, SCHEMA_VERSION, Shard, require_written
+from pipelines.schema.tables import SCENE_TABLES, SCHEMA_VERSION, Shard
 
 STAGING = ".staging"
 
@@ -105,32 +105,26 @@ def publish_shards(root: str, staging: str, manifests: list[dict], statistics: S
         storage.write_parquet(label_scenes(staged.read("scenes"), statistics), final.path("scenes"))
         return row
 
-    delete_other_files(root, manifests)
+    promised = {path: rows for m in manifests for path, rows in list_promised_rows(m, root, root).items()}
+    delete_other_files(root, manifests[0]["source"], promised)
     rows = [{k: m[k] for k in ("source", "split", "number")} for m in manifests if m["scenes"]]
     blocks = min(len(rows), max(2, 4 * int(ray.cluster_resources().get("CPU", 1))))
     map_rows(ray.data.from_items(rows, override_num_blocks=blocks), publish).materialize()
-    shards = [Shard(root, m["source"], m["split"], m["number"]) for m in manifests]
-    promised = list(zip(shards, manifests, strict=True))
-    require_written({shard: m["scenes"] for shard, m in promised if m["scenes"]})
-    storage.require_rows({s.path("rejects"): sum(m["rejects"].values()) for s, m in promised if m["rejects"]})
+    storage.require_rows(promised)
 
 
-def delete_other_files(root: str, manifests: list[dict]) -> None:
+def delete_other_files(root: str, source: str, wanted: Collection[str]) -> None:
     """Delete the files of shards that an interrupted run with another plan wrote.
 
     Args:
         root: Dataset directory.
-        manifests: Manifests of all shards.
+        source: Value of the source column.
+        wanted: Files of all shards of this run.
     """
-    wanted = set()
-    for manifest in manifests:
-        shard = Shard(root, manifest["source"], manifest["split"], manifest["number"])
-        tables = [*SCENE_TABLES] * bool(manifest["scenes"]) + ["rejects"] * bool(manifest["rejects"])
-        wanted |= {shard.path(table) for table in tables}
     for table in (*SCENE_TABLES, "rejects"):
-        place = storage.join_uri(root, table, f"source={manifests[0]['source']}")
-        for path in set(storage.list_files(place, ".parquet")) - wanted:
-            storage.delete_file(path)
+        for path in storage.list_files(storage.join_uri(root, table, f"source={source}"), ".parquet"):
+            if path not in wanted:
+                storage.delete_file(path)
 
 
 # ---------------------------------------------------------------------------------------------------------- run

@@ -23,7 +23,7 @@ from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.town import generator
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Extremes, merge_extremes
-from pipelines.schema.tables import MAX_HEIGHT_M, make_rejects_table, make_scene_tables
+from pipelines.schema.tables import MAX_HEIGHT_M, Shard, make_rejects_table, make_scene_tables
 
 BATCH_SCENES = 32
 
@@ -172,17 +172,26 @@ def make_manifest_path(staging: str, task: ShardTask) -> str:
     return storage.join_uri(staging, "manifest", f"{task.source}-{task.split}-{task.number:05d}.json")
 
 
-def _is_complete(manifest: dict, task: ShardTask, output: str, staging: str) -> bool:
-    """Return whether the files that a manifest promises exist and are not truncated."""
+def list_promised_rows(manifest: dict, output: str, place_of_scenes: str) -> dict[str, int]:
+    """List the files of a shard.
+
+    Args:
+        manifest: Manifest of the shard.
+        output: Dataset directory.
+        place_of_scenes: Directory of the table scenes: the staging directory or the dataset directory.
+
+    Returns:
+        Number of rows of each file.
+    """
+    shard, staged = (
+        Shard(root, manifest["source"], manifest["split"], manifest["number"]) for root in (output, place_of_scenes)
+    )
     scenes, rejects = manifest["scenes"], sum(manifest["rejects"].values())
-    shard = task.shard(output)
-    promised = {task.shard(staging).path("scenes"): scenes, shard.path("rasters"): scenes} if scenes else {}
-    promised |= {shard.path("rejects"): rejects} if rejects else {}
-    try:
-        storage.require_rows(promised)
-        return not scenes or storage.read_num_rows(shard.path("primitives")) >= 0
-    except ValueError:
-        return False
+    promised = {shard.path("rejects"): rejects} if rejects else {}
+    if scenes:
+        promised |= {staged.path("scenes"): scenes, shard.path("rasters"): scenes}
+        promised |= {shard.path("primitives"): manifest.get("primitives", -1)}  # version 0.2 lacks it
+    return promised
 
 
 def write_shard(task: ShardTask, output: str, staging: str, grid: Grid, read: ReadDrive = read_drive) -> dict:
@@ -208,7 +217,8 @@ def write_shard(task: ShardTask, output: str, staging: str, grid: Grid, read: Re
     parts = hashlib.blake2b(repr(task.parts).encode(), digest_size=16).hexdigest()
     if storage.exists(path):
         finished = storage.read_json(path)
-        if finished.get("parts") == parts and _is_complete(finished, task, output, staging):
+        is_current = finished.get("parts") == parts
+        if is_current and not storage.find_faulty_files(list_promised_rows(finished, output, staging)):
             return finished
     started = time.perf_counter()
     cuts = ShardCut(task, grid, read)
@@ -217,10 +227,10 @@ def write_shard(task: ShardTask, output: str, staging: str, grid: Grid, read: Re
         tables.append(make_scene_tables(batch))
         measured.append(compute_extremes(batch))
         classes = batch[0].ground_classes
-    num_scenes = 0
+    num_scenes = num_primitives = 0
     if tables:
         joined = join_tables(tables)
-        num_scenes = len(joined["scenes"])
+        num_scenes, num_primitives = len(joined["scenes"]), len(joined["primitives"])
         # The scenes lack density labels. They are written last, because they mark the shard as written.
         for name, root in (("primitives", output), ("rasters", output), ("scenes", staging)):
             storage.write_parquet(joined[name], task.shard(root).path(name))
@@ -232,6 +242,7 @@ def write_shard(task: ShardTask, output: str, staging: str, grid: Grid, read: Re
         "number": task.number,
         "parts": parts,
         "scenes": num_scenes,
+        "primitives": num_primitives,
         "rejects": dict(Counter(row["reason"] for row in cuts.rejects)),
         "unreadable": cuts.unreadable,
         "reports": cuts.reports,

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from typing import Any
+from typing import Any, TypeVar
 
 import pyarrow as pa
 import pyarrow.compute as compute
@@ -27,9 +27,11 @@ from models.uris import OBJECT_STORES, connect_fsspec, join_uri, resolve_uri, sp
 from pipelines.runtime.machines import identify_machine, is_process_alive
 from pipelines.runtime.parquet_sizes import ITEM_BYTES, measure_columns
 
+T = TypeVar("T")
 pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
 
 NUM_THREADS = 16  # Threads that read footers.
+MISSING = "no such file"  # End of the description of a missing file.
 TEMPORARY = ".tmp-"
 ABANDONED_S = 3600.0  # A temporary file of another machine is abandoned after this time without a change (s).
 # A text column that can exceed this size (bytes) is read with dictionary encoding until its total length is known.
@@ -350,7 +352,7 @@ def read_num_rows(uri: str) -> int:
         with fs.open_input_file(path) as stream:
             return pq.read_metadata(stream).num_rows
     except FileNotFoundError:
-        raise ValueError(f"{uri}: no such file") from None
+        raise ValueError(f"{uri}: {MISSING}") from None
     except Exception as error:  # A damaged file makes pyarrow raise errors of many types.
         raise ValueError(f"{uri}: not a complete Parquet file ({error})") from error
 
@@ -380,10 +382,32 @@ def read_bytes(uri: str, limit: str = "") -> bytes:
     return content
 
 
+def find_faults(files: Mapping[T, Sequence[str]], check: Callable[[T], str]) -> dict[T, str]:
+    """Find the parts of an output that are missing or faulty.
+
+    Directories are listed once, and `check` runs in several threads.
+
+    Args:
+        files: Files of each part.
+        check: Function that returns the fault of a part whose files exist, or "".
+
+    Returns:
+        Description of the fault of each faulty part, in order.
+    """
+    places = {split_name(uri)[0] for uris in files.values() for uri in uris}
+    there = {path for place in places for path in list_files(place, "")}
+
+    def find_fault(part: T) -> str:
+        missing = [uri for uri in files[part] if uri not in there]
+        return f"{missing[0]}: {MISSING}" if missing else check(part)
+
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        faults = zip(files, pool.map(find_fault, files), strict=True)
+    return {part: fault for part, fault in faults if fault}
+
+
 def find_faulty_files(promised: Mapping[str, int]) -> dict[str, str]:
     """Find the Parquet files that are missing, damaged or have another number of rows than promised.
-
-    Directories are listed once, and footers are read concurrently.
 
     Args:
         promised: Number of rows of each file.
@@ -391,20 +415,15 @@ def find_faulty_files(promised: Mapping[str, int]) -> dict[str, str]:
     Returns:
         Description of the fault of each faulty file.
     """
-    there = {path for place in {split_name(uri)[0] for uri in promised} for path in list_files(place, ".parquet")}
 
-    def find_fault(uri: str) -> str:
-        if uri not in there:
-            return f"{uri}: no such file"
+    def check_rows(uri: str) -> str:
         try:
             rows = read_num_rows(uri)
         except ValueError as error:
             return str(error)
         return "" if rows == promised[uri] else f"{uri}: {rows:,} rows, expected {promised[uri]:,}"
 
-    with ThreadPoolExecutor(NUM_THREADS) as pool:
-        faults = zip(promised, pool.map(find_fault, promised), strict=True)
-    return {uri: fault for uri, fault in faults if fault}
+    return find_faults({uri: [uri] for uri in promised}, check_rows)
 
 
 def require_rows(promised: Mapping[str, int]) -> None:
@@ -437,9 +456,10 @@ def raise_faults(faults: Mapping[Any, str], count: int) -> None:
 
 
 def measure_file_bytes(uri: str) -> int:
-    """Return the size of a file in bytes."""
+    """Return the size of a file in bytes, or -1 if there is no file."""
     fs, path = resolve_uri(uri)
-    return fs.get_file_info(path).size
+    info = fs.get_file_info(path)
+    return info.size if info.is_file else -1
 
 
 def write_text(text: str, uri: str) -> None:

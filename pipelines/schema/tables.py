@@ -12,7 +12,6 @@ import json
 import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -619,10 +618,6 @@ class Shard:
         for table, content in make_scene_tables(scenes).items():
             storage.write_parquet(content, self.path(table))
 
-    def is_written(self) -> bool:
-        """Return whether the files of the tables scenes, primitives and rasters exist."""
-        return all(storage.exists(self.path(table)) for table in SCENE_TABLES)
-
     def find_fault(self, num_scenes: int | None = None) -> str:
         """Compare the files of the tables scenes, primitives and rasters with each other.
 
@@ -652,24 +647,14 @@ class Shard:
 def find_faults(promised: Mapping[Shard, int]) -> dict[Shard, str]:
     """Find the shards that are missing, damaged or have another number of scenes than promised.
 
-    Directories are listed once, and footers are read concurrently.
-
     Args:
         promised: Number of scenes of each shard.
 
     Returns:
         Description of the fault of each faulty shard (`Shard.find_fault`).
     """
-    places = {shard.place(table) for shard in promised for table in SCENE_TABLES}
-    there = {path for place in places for path in storage.list_files(place, ".parquet")}
-
-    def find_fault(shard: Shard) -> str:
-        missing = [path for path in map(shard.path, SCENE_TABLES) if path not in there]
-        return f"{missing[0]}: no such file" if missing else shard.find_fault(promised[shard])
-
-    with ThreadPoolExecutor(storage.NUM_THREADS) as pool:
-        faults = zip(promised, pool.map(find_fault, promised), strict=True)
-    return {shard: fault for shard, fault in faults if fault}
+    files = {shard: [shard.path(table) for table in SCENE_TABLES] for shard in promised}
+    return storage.find_faults(files, lambda shard: shard.find_fault(promised[shard]))
 
 
 def require_written(promised: Mapping[Shard, int]) -> None:
@@ -695,7 +680,7 @@ def find_unwritten(promised: Mapping[Shard, int]) -> list[Shard]:
     """
     faults = find_faults(promised)
     for fault in faults.values():
-        if not fault.endswith("no such file"):
+        if not fault.endswith(storage.MISSING):
             logger.warning("%s; the shard is written again", fault)
     return list(faults)
 

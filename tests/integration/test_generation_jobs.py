@@ -5,6 +5,7 @@ from pathlib import Path
 
 import duckdb
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import trimesh
 from helpers import kill_ray_workers
@@ -49,6 +50,10 @@ def test_sample_resumes_interrupted_run(smoke, samples):
     kept, lost = Path(shards[0].path("scenes")), Path(shards[1].path("rasters"))
     stamp = kept.stat().st_mtime_ns
     lost.unlink()
+    damaged = [Path(shards[2].path("primitives")), Path(shards[3].path("scenes"))]
+    contents = [path.read_bytes() for path in damaged]
+    damaged[0].write_bytes(contents[0][:-100])
+    pq.write_table(pq.read_table(damaged[1], partitioning=None).slice(1), damaged[1])
     config = Config(
         model=str(smoke / "models/pritti-smoke"),
         output=str(samples),
@@ -58,6 +63,7 @@ def test_sample_resumes_interrupted_run(smoke, samples):
     )
     sample(config)
     assert kept.stat().st_mtime_ns == stamp and lost.exists()
+    assert [path.read_bytes() for path in damaged] == contents
     assert [s.scene_id for s in read_scenes(str(samples))] == before
     with pytest.raises(ValueError, match="with seed=0, asked for 5"):
         sample(replace(config, seed=5))

@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.fs as pafs
@@ -215,3 +216,48 @@ def test_missing_bucket_is_named_when_scenes_are_read(s3):
     root = join_uri("s3://absent-bucket/town?" + s3.uri().partition("?")[2])
     with pytest.raises(ValueError, match="s3://absent-bucket/town/scenes"):
         find_shards(root)
+
+
+def test_generated_and_edited_scenes_in_s3_equal_local(s3, cache, tmp_path):
+    from jobs.edit_scenes import Translate
+    from jobs.implementation.edit_scenes import edit_scenes
+    from jobs.implementation.sample_scenes import sample
+    from jobs.sample_scenes import Config
+
+    tiny_pipeline(small_spec()).save_pretrained(tmp_path / "model")
+    model = upload(tmp_path / "model", s3.uri("tiny"))
+    places = {"local": (str(tmp_path / "model"), str(tmp_path / "made")), "s3": (model, s3.uri("made"))}
+    tables = {}
+    for name, (given, output) in places.items():
+        options = {"num_scenes": 3, "num_inference_steps": 2, "existence_threshold": 0.01, "num_glb": 1}
+        s3.requests.clear()
+        sample(Config(model=given, output=output, **options))
+        edited = storage.join_uri(output, "moved")
+        edit_scenes(Translate(input=output, output=edited, where="true", offset_m=(1.0, 0.0, 0.0), num_examples=1))
+        tables[name] = {key: value for key, value in read_tables(output).items() if key.endswith(".parquet")}
+    assert len(tables["local"]) >= 16 and tables["s3"] == tables["local"]
+    files = [path for path in s3.list_writes() if "/.leases/" not in path and "/.node-" not in path]
+    assert len(files) <= 1.5 * len(set(files))
+    s3.requests.clear()
+    sample(Config(model=model, output=places["s3"][1], **options))  # everything is there
+    assert not [path for path in s3.list_writes() if path.endswith(".parquet")]
+    assert not list(Path.cwd().glob("s3:*"))
+
+
+def test_evaluation_of_scenes_in_s3_equals_local(s3, cache, tmp_path, monkeypatch):
+    from jobs.evaluate_scenes import Config
+    from jobs.implementation.evaluate_scenes import evaluate
+
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlflow.db")
+    monkeypatch.setenv("PRITTI_HOME", str(tmp_path / "home"))
+    ingest.ingest_drives(plan_town(24, 8, 0), str(tmp_path / "real"), {"source": "town"})
+    real = upload(tmp_path / "real", s3.uri("real"))
+    scores = {}
+    for name, root in (("local", str(tmp_path / "real")), ("s3", real)):
+        output = storage.join_uri(root, "evaluation")
+        asked = Config(
+            real=root, real_split="test", generated=root, generated_split="train", output=output, lite0=False
+        )
+        scores[name] = evaluate(replace(asked, num_examples=2, ceiling_split="train"))
+    assert repr(scores["s3"]) == repr(scores["local"]) and scores["s3"]["generation"]
+    assert storage.exists(storage.join_uri(real, "evaluation", "metrics.json"))
