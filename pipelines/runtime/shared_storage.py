@@ -28,19 +28,6 @@ def require_shared_storage(output: str) -> None:
             message names the node and the remedy.
     """
     nodes = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}
-    require_node_access(output, nodes)
-
-
-def require_node_access(output: str, nodes: dict[str, dict[str, Any]]) -> None:
-    """Check some nodes (`require_shared_storage`).
-
-    Args:
-        output: Directory or URI to which tasks will write.
-        nodes: Descriptions of nodes (`ray.nodes`) by id.
-
-    Raises:
-        ValueError: See `require_shared_storage`.
-    """
     token = secrets.token_hex(8)
     markers = {node: storage.join_uri(output, f"{MARKER}{token}-{node}") for node in nodes}
     write = ray.remote(num_cpus=0, max_retries=3)(write_marker)
