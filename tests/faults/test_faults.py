@@ -50,8 +50,12 @@ TOWN_WORDS = ("jobs/preprocess_scenes.py", "town", "--num-train", "48", "--num-t
 
 
 def read_directory(root: Path) -> dict[str, Any]:
-    """Return the content of all files in a directory, by path: tables of Parquet files and values of JSON files."""
+    """Return the content of all files in a directory, by path: tables of Parquet files and values of JSON files.
+
+    Records of leases are left out, because they count the jobs that wrote to the directory.
+    """
     files = {str(path.relative_to(root)): path for path in sorted(root.rglob("*")) if path.is_file()}
+    files = {name: path for name, path in files.items() if not name.startswith(".leases/")}
     return {
         name: pq.read_table(path, partitioning=None) if name.endswith(".parquet") else json.loads(path.read_text())
         for name, path in files.items()
