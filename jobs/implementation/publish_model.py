@@ -12,11 +12,10 @@ import torch
 
 from jobs.publish_model import Config
 from jobs.support.cli import home_path, resolve_path
-from jobs.support.model_directories import find_pipeline_directory
+from jobs.support.model_directories import find_pipeline_directory, publish_directory
 from jobs.support.outputs import hold_lease
 from jobs.support.registry import EXPERIMENT, PIPELINE, register_version
 from jobs.support.tracking import Tracker, find_tracking_uri, hide_credentials, make_client
-from jobs.support.trainer import publish_directory
 from models.labels import LABELS
 from models.pipeline import PrITTIPipeline
 from models.pretrained import CHECKSUMS_NAME, TRAINING_NAME, WEIGHTS, compute_checksums

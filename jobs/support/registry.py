@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import re
 import tempfile
 from pathlib import Path
 
 from mlflow.exceptions import MlflowException
 
+from jobs.support.cli import home_path
+from jobs.support.model_directories import publish_directory
 from jobs.support.tracking import find_tracking_uri, hide_credentials, make_client
 from models.base import MAX_CONFIG_BYTES
-from models.local_copy import find_cache_directory
 from models.options import show_value
 from models.pretrained import CHECKSUMS_NAME, INDEX_NAME, compute_checksums
 from models.strict_json import parse_json
+from pipelines.runtime import storage
 
 EXPERIMENT = "pritti-zoo"
 PIPELINE = "pipeline"  # artifact directory of a publishing run
@@ -43,10 +44,15 @@ def register_version(name: str, run_id: str) -> str:
 
 
 def download_pipeline(reference: str) -> str:
-    """Copy a published pipeline to the local cache if it is not there, and return its directory.
+    """Copy a published pipeline to $PRITTI_HOME/registry if it is not there, and return its directory.
+
+    All nodes of a cluster read this directory, so it is not in the local cache.
 
     Args:
         reference: models:/NAME/VERSION or the id of a publishing run.
+
+    Returns:
+        Directory or URI.
 
     Raises:
         ValueError: MLflow does not know the reference, or the files do not match the published checksums.
@@ -62,18 +68,15 @@ def download_pipeline(reference: str) -> str:
             raise ValueError(
                 f"{reference}: {show_value(run_id)} is no id of an MLflow run, expected 32 digits 0-9, a-f"
             )
-        registry = find_cache_directory("registry")
-        directory = os.path.join(registry, run_id)
-        if os.path.exists(os.path.join(directory, INDEX_NAME)):
+        directory = home_path("registry", run_id)
+        if storage.exists(storage.join_uri(directory, INDEX_NAME)):
             return directory
-        registry.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=registry) as staging:
+        with tempfile.TemporaryDirectory() as staging:
             whole = api.download_artifacts(run_id, PIPELINE, staging)
             require_plain_files(whole, staging)
             if compute_checksums(whole) != read_checksums(Path(whole, CHECKSUMS_NAME)):
                 raise ValueError(f"{reference}: its files do not match its {CHECKSUMS_NAME}; publish it again")
-            if not os.path.exists(directory):  # another process may have finished the same download first
-                os.rename(whole, directory)
+            publish_directory(whole, directory)
     except (MlflowException, OSError) as error:
         raise ValueError(
             f"{reference}: no published pipeline in {hide_credentials(find_tracking_uri())} "

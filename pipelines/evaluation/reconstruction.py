@@ -45,7 +45,7 @@ from pipelines.metrics.reconstruction import (
 from pipelines.metrics.validity import LABEL_MEASURES, compute_validity_rates
 from pipelines.rendering.render import render_3d, render_bev
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import count_gpus_per_actor, flat_map_dataset, map_dataset
+from pipelines.runtime.ray_tasks import count_gpus_per_actor, flat_map_dataset, make_numbered_rows, map_dataset
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
@@ -252,7 +252,7 @@ def reconstruct_chunks(chunks: list[Chunk], lvae: str, num_actors: int) -> ray.d
     per_actor, cluster = count_gpus_per_actor(), ray.cluster_resources()
     room = int(cluster.get("GPU", 0)) if per_actor else max(1, int(cluster.get("CPU", 1)))
     return map_dataset(
-        ray.data.range(len(chunks), override_num_blocks=len(chunks)),
+        make_numbered_rows(range(len(chunks))),
         Reconstructor,
         fn_constructor_args=(chunks, lvae),
         compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(chunks), room)),

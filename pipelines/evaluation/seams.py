@@ -22,7 +22,7 @@ from pipelines.metrics.seams import (
 from pipelines.rendering.render import MARK_COLOR, render_bev
 from pipelines.reporting.evaluation_report import format_value
 from pipelines.reporting.report import Picture, Pictures, Table, Text, render_report_html
-from pipelines.runtime.ray_tasks import flat_map_dataset
+from pipelines.runtime.ray_tasks import flat_map_dataset, make_numbered_rows
 from pipelines.schema.scene_subset import SceneSubset, select_evenly
 from pipelines.schema.tables import Shard
 
@@ -128,7 +128,7 @@ def measure_seams(
     if is_joined and sum(len(rows) for _, rows in parts) < 2:
         raise ValueError(f"{selection.root}: one scene is selected; joined scenes need at least two")
     graph = flat_map_dataset(
-        ray.data.range(len(parts), override_num_blocks=len(parts)),
+        make_numbered_rows(range(len(parts))),
         measure_shard,
         fn_kwargs={"parts": parts, "lines": lines, "is_joined": is_joined},
         num_cpus=READER_CPUS,

@@ -11,14 +11,13 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import pyarrow as pa
-import ray.data
 
 from pipelines.geometry.voxels import NUM_CLASSES, VoxelGrid, voxelize
 from pipelines.io.voxel_import import read_voxels
 from pipelines.metrics.reconstruction import compute_voxel_confusion, compute_voxel_scores
 from pipelines.preprocess.import_external import find_files, make_scene_id
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import flat_map_dataset
+from pipelines.runtime.ray_tasks import flat_map_dataset, make_numbered_rows
 from pipelines.schema.axis_convention import Axes
 from pipelines.schema.palette import EMPTY
 from pipelines.schema.tables import Shard, find_shards
@@ -156,7 +155,7 @@ def score_voxels(
     """Return the scores over all scenes as a nested dictionary of numbers, and a table with one row per scene."""
     chunks = split_chunks(pairs)
     graph = flat_map_dataset(
-        ray.data.range(len(chunks), override_num_blocks=len(chunks)),
+        make_numbered_rows(range(len(chunks))),
         score_chunk,
         fn_args=(chunks, grid, axes, truth_axes),
         num_cpus=1,

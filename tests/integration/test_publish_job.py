@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from models.local_copy import find_cache_directory
 from models.pretrained import CHECKSUMS_NAME, compute_checksums
 
 
@@ -57,7 +56,7 @@ def test_publish_writes_model_with_card_and_finds_it(smoke, evaluation_directory
     for name in ("tiny", reference, run_id):
         again = load_pipeline(find_pipeline_directory(name)).dit.state_dict()
         assert {name: value.tolist() for name, value in again.items()} == trained
-    kept = find_cache_directory("registry") / run_id
+    kept = smoke / "registry" / run_id
     assert (
         json.loads((kept / CHECKSUMS_NAME).read_text()) == compute_checksums(kept)
         and len(list(kept.parent.iterdir())) == 1

@@ -337,7 +337,7 @@ def registry(directory, tmp_path, monkeypatch):
     from jobs.support import registry
     from models.pretrained import compute_checksums
 
-    monkeypatch.setenv("PRITTI_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("PRITTI_HOME", str(tmp_path / "home"))
     (directory / "checksums.json").write_text(json.dumps(compute_checksums(directory)))
     server = FakeRegistry("0123456789abcdef" * 2, directory)
     monkeypatch.setattr(registry, "make_client", lambda uri: server)
