@@ -35,7 +35,17 @@ import pyarrow.fs as pafs
 import pyarrow.parquet as pq
 import tyro
 from common import describe_machine
-from raylets import KEYS, ROOT, Cluster, are_namespaces_allowed, run_cluster, run_mlflow, run_s3
+from raylets import (
+    KEYS,
+    ROOT,
+    Cluster,
+    are_namespaces_allowed,
+    create_bucket,
+    run_cluster,
+    run_mlflow,
+    run_s3,
+    wait_for_server,
+)
 
 from models.uris import join_uri, resolve_uri
 
@@ -43,16 +53,16 @@ from models.uris import join_uri, resolve_uri
 # the name of the run.
 STAGES = {
     "preprocess": "preprocess_scenes town --num-train 32 --num-test 16 --output @",
-    "train_lvae": "train_lvae smoke --dataset @preprocess --name % --output @ --steps 24",
+    "train_lvae": "train_lvae smoke --dataset @preprocess --name % --output @ --steps 24 --checkpoint-every 8",
     "encode": "encode_latents --dataset @preprocess --lvae @train_lvae --output @",
-    "train_dit": "train_dit smoke --dataset @preprocess --latents @encode --name % --output @ --steps 24",
+    "train_dit": "train_dit smoke --dataset @preprocess --latents @encode --name % --output @ --steps 24 --checkpoint-every 8",
     "sample": "sample_scenes --model @train_dit --num-scenes 136 --num-inference-steps 2 --existence-threshold 0.01"
     " --num-actors 2 --output @",
     "outpaint": "outpaint_scenes --model @train_dit --input @sample --max-scenes 1 --guided --num-inference-steps 2"
     " --num-actors 2 --output @",
     "edit": "edit_scenes translate --input @sample --where true --offset-m 1 0 0 --num-examples 1 --output @",
     "evaluate": "evaluate_scenes --real @preprocess --generated @sample --run samples --lvae @train_lvae --lite0 False"
-    " --num-examples 1 --output @",
+    " --max-scenes 24 --max-reconstructed-scenes 8 --num-examples 1 --output @",
     "publish": "publish_model --name % --model @train_dit --evaluation @evaluate --output @",
     "load": "sample_scenes --model models:/publish/1 --num-scenes 2 --num-inference-steps 2 --output @",
 }
@@ -245,6 +255,7 @@ def open_store(kind: str, folder: Path, num_raylets: int, **options: Any) -> Ite
         | {
             "PRITTI_CACHE": str(disk / "cache"),
             "RAY_worker_niceness": "0",
+        "RAY_idle_worker_killing_time_threshold_ms": "300000",
             "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.2",
             "OMP_NUM_THREADS": "1",
             "OMP_WAIT_POLICY": "PASSIVE",
@@ -254,7 +265,7 @@ def open_store(kind: str, folder: Path, num_raylets: int, **options: Any) -> Ite
         }
     )
     with ExitStack() as stack:
-        home = str(folder / "home")
+        home, url = str(folder / "home"), ""
         if kind == "s3":
             url = stack.enter_context(run_s3(folder, environment))
             home = f"s3://tests/home?endpoint_override={url}&region=us-east-1"
@@ -264,6 +275,9 @@ def open_store(kind: str, folder: Path, num_raylets: int, **options: Any) -> Ite
         os.environ |= KEYS
         private = disk if kind == "s3" else None
         cluster = stack.enter_context(run_cluster(Cluster(folder, private, environment), num_raylets, **options))
+        if kind == "s3":
+            create_bucket(url)
+        wait_for_server(f"{environment['MLFLOW_TRACKING_URI']}/health")
         yield Store(kind, home, cluster)
 
 

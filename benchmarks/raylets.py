@@ -53,40 +53,49 @@ def kill_family(process: subprocess.Popen | psutil.Process) -> None:
 
 
 @contextmanager
-def run_server(words: Sequence[str], url: str, folder: Path, environment: Mapping[str, str]) -> Iterator[None]:
-    """Run a server until the body ends; wait until its URL answers."""
+def run_server(words: Sequence[str], folder: Path, environment: Mapping[str, str]) -> Iterator[None]:
+    """Run a server until the body ends. The body calls `wait_for_server` before its first request."""
     with (folder / f"{Path(words[0]).name}.log").open("w") as log:
         process = subprocess.Popen(words, cwd=folder, env=dict(environment), stdout=log, stderr=log)
     try:
-        end = time.monotonic() + 90
-        while True:
-            with suppress(OSError), urllib.request.urlopen(url, timeout=5):
-                break
-            if process.poll() is not None or time.monotonic() > end:
-                raise RuntimeError(f"{words[0]} does not answer at {url}: {Path(log.name).read_text()[-2000:]}")
-            time.sleep(0.1)
         yield
     finally:
         kill_family(process)
 
 
+def wait_for_server(url: str, seconds: float = 90.0) -> None:
+    """Wait until a URL answers."""
+    end = time.monotonic() + seconds
+    while True:
+        with suppress(OSError), urllib.request.urlopen(url, timeout=5):
+            return
+        if time.monotonic() > end:
+            raise RuntimeError(f"no answer at {url}")
+        time.sleep(0.1)
+
+
 @contextmanager
 def run_s3(folder: Path, environment: Mapping[str, str]) -> Iterator[str]:
-    """Run an S3 server (moto) with the bucket `tests`; yield its URL."""
-    import boto3
-
+    """Run an S3 server (moto); yield its URL. `create_bucket` waits for it."""
     port = find_free_port()
     url = f"http://127.0.0.1:{port}"
     command = [str(Path(sys.executable).with_name("moto_server")), "-H", "127.0.0.1", "-p", str(port)]
-    with run_server(command, f"{url}/moto-api/", folder, environment):
-        keys = {"aws_access_key_id": "testing", "aws_secret_access_key": "testing", "region_name": "us-east-1"}
-        boto3.client("s3", endpoint_url=url, **keys).create_bucket(Bucket="tests")
+    with run_server(command, folder, environment):
         yield url
+
+
+def create_bucket(url: str) -> None:
+    """Create the bucket `tests` of an S3 server, as soon as the server answers."""
+    import boto3
+
+    wait_for_server(f"{url}/moto-api/")
+    keys = {"aws_access_key_id": "testing", "aws_secret_access_key": "testing", "region_name": "us-east-1"}
+    boto3.client("s3", endpoint_url=url, **keys).create_bucket(Bucket="tests")
 
 
 @contextmanager
 def run_mlflow(folder: Path, artifacts: str, environment: Mapping[str, str]) -> Iterator[str]:
-    """Run an MLflow server with its database in `folder`; yield its URL.
+    """Run an MLflow server with its database in `folder`; yield its URL, which answers at /health later.
 
     Clients write artifacts to `artifacts`, a path or s3:// URI, without this server.
     """
@@ -94,7 +103,7 @@ def run_mlflow(folder: Path, artifacts: str, environment: Mapping[str, str]) -> 
     url = f"http://127.0.0.1:{port}"
     command = [str(Path(sys.executable).with_name("mlflow")), "server", "--host", "127.0.0.1", "--port", str(port)]
     command += ["--workers", "1", "--backend-store-uri", f"sqlite:///{folder}/mlflow.db", "--no-serve-artifacts"]
-    with run_server([*command, "--default-artifact-root", artifacts], f"{url}/health", folder, environment):
+    with run_server([*command, "--default-artifact-root", artifacts], folder, environment):
         yield url
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -65,3 +66,26 @@ def run_s3_server() -> Iterator[S3Server]:
     finally:
         http.shutdown()
         thread.join()
+
+
+@contextmanager
+def record_connections() -> Iterator[tuple[str, list[bytes]]]:
+    """Listen as an HTTP proxy that refuses all requests; yield its URL and the list of first lines of the requests."""
+    lines: list[bytes] = []
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def listen() -> None:
+        while True:
+            try:
+                connection, _ = server.accept()
+            except OSError:  # The server is closed.
+                return
+            with connection:
+                lines.append(connection.recv(1000).split(b"\r\n")[0])
+                connection.sendall(b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n")
+
+    threading.Thread(target=listen, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.getsockname()[1]}", lines
+    finally:
+        server.close()

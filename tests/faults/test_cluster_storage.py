@@ -1,75 +1,50 @@
-"""Tests of a cluster of two raylets that do not share the output: each has its own mount namespace."""
+"""Tests of clusters whose nodes share no disk: each raylet has its own mount namespace."""
 
+import json
 import os
 import re
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 from helpers import ROOT
+from s3_server import record_connections
 
-import psutil  # isort: skip # Ray bundles this module; import ray first
+sys.path.insert(0, str(ROOT / "benchmarks"))
+import chaos
+from raylets import Cluster, are_namespaces_allowed, run_cluster
 
-RAY = [str(Path(sys.executable).with_name("ray"))]
-MOUNT = 'mount -t tmpfs none "$0" && exec "$@"'
+from models.uris import join_uri, resolve_uri
+from pipelines.runtime import storage
+
+pytestmark = pytest.mark.skipif(not are_namespaces_allowed(), reason="mount namespaces are forbidden (unshare -rm)")
 TOWN_WORDS = ("jobs/preprocess_scenes.py", "town", "--num-train", "16", "--num-test", "8", "--output")
+RUN_JOBS = """
+import json, sys, time
+from jobs.support.cli import run
+for path, *words in json.loads(sys.argv[1]):
+    print(f"{time.monotonic():.0f} s: {path}", flush=True)
+    run(path.rpartition("/")[2].removesuffix(".py"), words)
+"""
 
 
-@contextmanager
-def start_raylets(private: Path, folder: Path) -> Iterator[dict[str, str]]:
-    """Start a head and a second node that sees an empty directory at `private`; yield the environment of jobs.
-
-    Only the processes that this function starts are ended.
-    """
-    probe = subprocess.run(["unshare", "-rm", "sh", "-c", MOUNT, str(private), "true"], capture_output=True)
-    if probe.returncode:
-        pytest.skip("mount namespaces are forbidden here (unshare -rm)")
-    environment = os.environ | {
-        "RAY_AUTH_MODE": "disabled",
-        "RAY_TMPDIR": str(folder),
-        "PYTHONPATH": str(ROOT),
-    }
-    for name in ("RAY_ADDRESS", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
-        environment.pop(name, None)
-    port = str(20_000 + os.getpid() % 10_000)
-    head = ["start", "--head", "--port", port, "--num-cpus=1", "--include-dashboard=false"]
-    second = ["start", f"--address=127.0.0.1:{port}", "--num-cpus=1"]
-    common = ["--node-ip-address=127.0.0.1", "--block", "--disable-usage-stats", "--object-store-memory=100000000"]
-    processes = []
-    try:
-        for words in ([*RAY, *head], ["unshare", "-rm", "sh", "-c", MOUNT, str(private), *RAY, *second]):
-            log = (folder / f"node-{len(processes)}.log").open("w")
-            processes.append(subprocess.Popen([*words, *common], env=environment, stdout=log, stderr=log))
-            wait_for_line(Path(log.name), "--block")
-        yield environment | {"RAY_ADDRESS": f"127.0.0.1:{port}"}
-    finally:
-        family = [child for p in processes for child in psutil.Process(p.pid).children(recursive=True)]
-        for process in [*processes, *family]:
-            with suppress(psutil.NoSuchProcess):
-                process.kill()
-        for process in processes:
-            process.wait()
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """A folder with a short path, as Ray's sockets need."""
+    path = Path(os.environ.get("TMPDIR", "/tmp")) / f"pritti-{os.getpid()}-{time.monotonic_ns() % 10**6}"
+    path.mkdir()
+    return path
 
 
-def wait_for_line(log: Path, text: str, seconds: float = 60.0) -> None:
-    """Wait until a line of a log contains a text."""
-    end = time.monotonic() + seconds
-    while text not in log.read_text():
-        assert time.monotonic() < end, log.read_text()[-2000:]
-        time.sleep(0.2)
-
-
-def test_output_that_nodes_do_not_share_stops_the_job(tmp_path_factory):
-    folder = Path(os.environ.get("TMPDIR", "/tmp")) / f"pritti-{os.getpid()}"  # Ray's sockets need a short path.
-    folder.mkdir(exist_ok=True)
-    output = tmp_path_factory.mktemp("output")
-    with start_raylets(output, folder) as environment:
+def test_output_that_nodes_do_not_share_stops_the_job(folder, tmp_path):
+    output = tmp_path / "output"
+    output.mkdir()
+    with run_cluster(Cluster(folder, output, dict(os.environ)), 2) as cluster:
         words = [sys.executable, *TOWN_WORDS, str(output / "town")]
-        done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=200)
+        done = subprocess.run(words, cwd=ROOT, env=cluster.environment, capture_output=True, text=True, timeout=200)
         lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
         assert done.returncode == 2 and len(lines) == 1, done.stdout[-2000:] + done.stderr[-3000:]
         assert re.search(
@@ -78,3 +53,52 @@ def test_output_that_nodes_do_not_share_stops_the_job(tmp_path_factory):
             lines[0],
         )
         assert not [path for path in output.rglob("*") if path.is_file()]
+
+
+def test_chain_on_s3_survives_loss_of_a_node(folder, cluster, tmp_path, monkeypatch):
+    import ray
+
+    from jobs.implementation.sample_scenes import sample
+    from jobs.sample_scenes import Config
+    from models.local_copy import make_local_copy
+
+    with record_connections() as (proxy, connections), chaos.open_store("s3", folder / "s3", 2) as store:
+        outside = {name: proxy for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY")}
+        near = {name: f"127.0.0.1,localhost,{ray.util.get_node_ip_address()}" for name in ("no_proxy", "NO_PROXY")}
+        environment = store.cluster.environment | outside | near | {"PRITTI_HOME": store.home}
+        words = json.dumps([store.list_words(stage, stage)[1:] for stage in chaos.STAGES])
+        with (folder / "out").open("w") as log:
+            driver = subprocess.Popen(
+                [sys.executable, "-c", RUN_JOBS, words],
+                cwd=store.cluster.folder,
+                env=environment,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
+        scenes = join_uri(store.home, "results", "sample", "scenes")
+        while driver.poll() is None and not storage.list_files(scenes, ".parquet"):
+            time.sleep(0.1)
+        store.cluster.kill_raylet(1)
+        code = chaos.wait(driver, 400)
+        assert code == 0, (folder / "out").read_text()[-5000:]
+        digests = {stage: store.digest(stage) for stage in chaos.STAGES}
+        assert all(digests.values())
+        assert connections == []  # No request to a model hub or any other host
+        assert not list(folder.rglob("s3:*")) and not list(Path.cwd().glob("s3:*"))
+        # The same tables as those of a local run with a local copy of the model.
+        model = make_local_copy(join_uri(store.home, "results", "train_dit"))
+        words = store.list_words("sample", "sample")
+        count, steps = (int(words[words.index(name) + 1]) for name in ("--num-scenes", "--num-inference-steps"))
+        monkeypatch.setenv("OMP_NUM_THREADS", "1")
+        sample(
+            Config(
+                model=model,
+                output=str(tmp_path / "local"),
+                num_scenes=count,
+                num_inference_steps=steps,
+                existence_threshold=0.01,
+            )
+        )
+        local = resolve_uri(str(tmp_path / "local"))
+        tables = {name: value for name, value in digests["sample"].items() if name.endswith(".parquet")}
+        assert tables == {name: chaos.digest_file(local[0], f"{local[1]}/{name}") for name in tables}
