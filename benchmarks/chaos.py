@@ -55,7 +55,8 @@ STAGES = {
     "preprocess": "preprocess_scenes town --num-train 32 --num-test 16 --output @",
     "train_lvae": "train_lvae smoke --dataset @preprocess --name % --output @ --steps 24 --checkpoint-every 8",
     "encode": "encode_latents --dataset @preprocess --lvae @train_lvae --output @",
-    "train_dit": "train_dit smoke --dataset @preprocess --latents @encode --name % --output @ --steps 24 --checkpoint-every 8",
+    "train_dit": "train_dit smoke --dataset @preprocess --latents @encode --name % --output @ --steps 24"
+    " --checkpoint-every 8",
     "sample": "sample_scenes --model @train_dit --num-scenes 136 --num-inference-steps 2 --existence-threshold 0.01"
     " --num-actors 2 --output @",
     "outpaint": "outpaint_scenes --model @train_dit --input @sample --max-scenes 1 --guided --num-inference-steps 2"
@@ -255,7 +256,7 @@ def open_store(kind: str, folder: Path, num_raylets: int, **options: Any) -> Ite
         | {
             "PRITTI_CACHE": str(disk / "cache"),
             "RAY_worker_niceness": "0",
-        "RAY_idle_worker_killing_time_threshold_ms": "300000",
+            "RAY_idle_worker_killing_time_threshold_ms": "300000",
             "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.2",
             "OMP_NUM_THREADS": "1",
             "OMP_WAIT_POLICY": "PASSIVE",
