@@ -180,7 +180,8 @@ def find_victims(cluster: Cluster, kind: str, driver: subprocess.Popen) -> list[
     if kind == "raylet":
         return [lambda number=number: cluster.kill_raylet(number) for number in cluster.raylets if number]
     workers = [process for number in sorted(cluster.raylets) for process in cluster.find_processes(number, "ray::")]
-    return [kill_worker(process) for process in workers if "IDLE" not in read_command(process)]
+    idle = ("IDLE", "Agent")  # The loss of an agent ends its raylet.
+    return [kill_worker(process) for process in workers if not any(word in read_command(process) for word in idle)]
 
 
 def read_command(process: psutil.Process) -> str:
@@ -240,7 +241,7 @@ def disturb(store: Store, stage: str, run: str, victim: str, rng: random.Random)
 def restore_raylets(cluster: Cluster) -> None:
     """Replace killed raylets."""
     for number in range(cluster.num_raylets):
-        if number not in cluster.raylets:
+        if number not in cluster.raylets or cluster.raylets[number].poll() is not None:
             cluster.start_raylet(number)
 
 

@@ -146,7 +146,8 @@ class Cluster:
         environment = dict(self.environment)
         address = environment.pop("RAY_ADDRESS", "")
         command = [RAY, "start", *(words or [f"--address={address}"]), f"--num-cpus={self.num_cpus}", "--block"]
-        command += ["--node-ip-address=127.0.0.1", "--disable-usage-stats"]
+        # Jobs join the node that has their address, 127.0.0.1. This is the head.
+        command += [f"--node-ip-address=127.0.0.{number + 1}", "--disable-usage-stats"]
         command += [f"--object-store-memory={OBJECT_STORE_BYTES}"]
         if self.private and number:
             command = ["unshare", "-rm", "sh", "-c", MOUNT, str(self.private), *command]
