@@ -14,6 +14,7 @@ The runner prints one line per run and ends with exit code 1 if a run differs.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import random
@@ -76,7 +77,7 @@ VICTIMS = ("worker", "raylet", "driver")
 @dataclass(frozen=True)
 class Config:
     kills: int = 100
-    """Number of disturbed runs, each with one kill."""
+    """Number of kills. Each disturbed run has one, unless the stage ends before the kill."""
     stores: tuple[Literal["disk", "s3"], ...] = ("disk", "s3")
     """Storage of all inputs and outputs; the runs use the stores in turn."""
     stages: tuple[str, ...] = DISTURBED
@@ -201,7 +202,7 @@ def kill_worker(process: psutil.Process) -> Callable[[], object]:
 def disturb(store: Store, stage: str, run: str, victim: str, rng: random.Random) -> dict[str, Any]:
     """Run a stage with one kill; return a record with the differences to the undisturbed run."""
     log = store.cluster.folder / f"{run}.log"
-    moment_s = rng.random() * store.seconds[stage]
+    moment_s = 0.9 * rng.random() * store.seconds[stage]
     started, killed, attempts, failures = time.monotonic(), "", 1, []
     process = store.start(stage, run, log)
     with suppress(subprocess.TimeoutExpired):
@@ -293,7 +294,9 @@ def main(config: Config) -> int:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="chaos-")))
         stores: dict[str, Store] = {}
-        for k in range(config.first, config.first + config.kills):
+        for k in itertools.count(config.first):
+            if sum(counts[victim] for victim in VICTIMS) == config.kills:
+                break
             rng = random.Random(f"{config.seed} {k}")
             kind, stage = config.stores[k % len(config.stores)], config.stages[k % len(config.stages)]
             if kind not in stores:

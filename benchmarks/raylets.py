@@ -124,11 +124,12 @@ class Cluster:
     raylets: dict[int, subprocess.Popen] = field(default_factory=dict)
     num_raylets: int = 0
     num_cpus: int = 1
+    num_gpus: int = 0
 
-    def start(self, num_raylets: int, num_cpus: int = 1, dashboard: bool = False) -> None:
-        """Start the head and further raylets, each with `num_cpus` CPUs."""
+    def start(self, num_raylets: int, num_cpus: int = 1, num_gpus: int = 0, dashboard: bool = False) -> None:
+        """Start the head and further raylets, each with `num_cpus` CPUs; `num_gpus` GPUs exist by name only."""
         port = find_free_port()
-        self.num_raylets, self.num_cpus = num_raylets, num_cpus
+        self.num_raylets, self.num_cpus, self.num_gpus = num_raylets, num_cpus, num_gpus
         for name in ("RAY_ADDRESS", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
             self.environment.pop(name, None)
         self.environment |= {"RAY_AUTH_MODE": "disabled", "RAY_TMPDIR": str(self.folder), "PYTHONPATH": str(ROOT)}
@@ -146,6 +147,7 @@ class Cluster:
         environment = dict(self.environment)
         address = environment.pop("RAY_ADDRESS", "")
         command = [RAY, "start", *(words or [f"--address={address}"]), f"--num-cpus={self.num_cpus}", "--block"]
+        command += [f"--num-gpus={self.num_gpus}"] if self.num_gpus else []
         # Jobs join the node that has their address, 127.0.0.1. This is the head.
         command += [f"--node-ip-address=127.0.0.{number + 1}", "--disable-usage-stats"]
         command += [f"--object-store-memory={OBJECT_STORE_BYTES}"]

@@ -20,7 +20,7 @@ from typing import Annotated
 import tyro
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption
+from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, WaitForResourcesOption
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,7 @@ class Encoding:
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/ablations/encoding)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,8 @@ class Branches:
     """Global batch size over all workers (default: as in the preset)."""
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
+    gpus: GpusOption = None
+    wait_for_resources_s: WaitForResourcesOption = 0.0
     max_scenes: int | None = None
     """Maximum number of held-out scenes to evaluate, selected evenly from the split (default: all)."""
     num_checkpoints: int = 4
@@ -84,6 +87,7 @@ class Branches:
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/ablations/<name>)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jobs.support.cli import resolve_path, run
-from jobs.support.options import IfBusyOption, SceneOptions
+from jobs.support.options import IfBusyOption, LogFormatOption, SceneOptions
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class EditOptions(SceneOptions):
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/edited/<run>)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     run: str = "edited"
     """Name of the run: scenes get source=edited-<run>."""
     num_examples: int = 8

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption
+from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, WaitForResourcesOption
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,11 @@ class Config:
     output: str = ""
     """Directory to write latents/ and latents.json to (default: the dataset directory)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     num_actors: int = 1
     """Number of models that run in parallel; use one per GPU."""
+    gpus: GpusOption = None
+    wait_for_resources_s: WaitForResourcesOption = 0.0
     batch_size: int = 16
     """Scenes per batch."""
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption
+from jobs.support.options import IfBusyOption, LogFormatOption
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ class Config:
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/seams)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     num_actors: int = 2
     """Number of actors that run in parallel."""
 

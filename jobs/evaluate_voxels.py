@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption
+from jobs.support.options import IfBusyOption, LogFormatOption
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Config:
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/voxels)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption, SceneOptions
+from jobs.support.options import IfBusyOption, LogFormatOption, SceneOptions
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,7 @@ class Config(SceneOptions):
     output: str = ""
     """Directory to write to (default: export/ in the input directory)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     overwrite: bool = False
     """Replace existing files."""
 

@@ -21,7 +21,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption
+from jobs.support.options import IfBusyOption, LogFormatOption
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,7 @@ class Config:
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/imported/<name>)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import resolve_path, run
-from jobs.support.options import IfBusyOption, RePaintOptions
+from jobs.support.options import IfBusyOption, LogFormatOption, RePaintOptions
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ class Config(RePaintOptions):
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/inpainted)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     run: str = "inpainted"
     """Name of the run: scenes get source=generated-<run>."""
     num_examples: int = 8

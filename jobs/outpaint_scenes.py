@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import resolve_path, run
-from jobs.support.options import IfBusyOption, RePaintOptions
+from jobs.support.options import IfBusyOption, LogFormatOption, RePaintOptions
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,7 @@ class Config(RePaintOptions):
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/outpainted)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     run: str = "outpainted"
     """Name of the run: scenes get source=generated-<run>."""
     extent_m: tuple[float, float] | None = None

@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption
+from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, WaitForResourcesOption
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,10 @@ class Config:
     """Random seed of the noise, which is the same for every frame."""
     num_actors: int = 1
     """Number of pipelines that run in parallel; use one per GPU."""
+    gpus: GpusOption = None
+    wait_for_resources_s: WaitForResourcesOption = 0.0
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
 
 
 if __name__ == "__main__":

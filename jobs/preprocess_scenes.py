@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption
+from jobs.support.options import IfBusyOption, LogFormatOption
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class Town:
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/town)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     num_train: int = 10_000
     """Number of training scenes."""
     num_test: int = 1_000
@@ -49,6 +50,7 @@ class Kitti360:
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/kitti360)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     make_split: bool = True
     """Split each drive into training and test segments as in the paper; --no-make-split trains on every pose."""
     slots: Literal["p95", "paper"] = "p95"
@@ -67,6 +69,7 @@ class Av2:
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/av2)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     skip_unreadable: bool = False
     """Skip logs with unreadable files and list them in rejects; without this option, the job stops."""
 
@@ -80,6 +83,7 @@ class Own:
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/own)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     make_split: bool = True
     """Split each drive into training and test segments as in the paper; --no-make-split trains on every pose."""
     slots: Literal["p95", "paper"] = "p95"

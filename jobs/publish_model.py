@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption, ModelOption
+from jobs.support.options import IfBusyOption, LogFormatOption, ModelOption
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class Config:
     output: str = ""
     """Directory to write weights and model card to (default: $PRITTI_HOME/zoo/<name>)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     register: bool = True
     """Also register the pipeline as a model version in MLflow."""
 

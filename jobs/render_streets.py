@@ -20,7 +20,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption, SceneOptions
+from jobs.support.options import IfBusyOption, LogFormatOption, SceneOptions
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class Config(SceneOptions):
     output: str = ""
     """Directory in which the job writes streets/ (default: the input directory)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     run: str = "drive"
     """Name of the run and of its directory under streets/."""
     spacing_m: float = 1.0

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption, ModelOption
+from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, ModelOption, WaitForResourcesOption
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class Config:
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/generated)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     run: str = "samples"
     """Name of the run: scenes get source=generated-<run>."""
     num_scenes: int = 64
@@ -48,6 +49,8 @@ class Config:
     """Repair floating, sunken and overlapping objects, as jobs/edit_scenes.py repair --no-drop does."""
     num_actors: int = 1
     """Number of pipelines that run in parallel; use one per GPU."""
+    gpus: GpusOption = None
+    wait_for_resources_s: WaitForResourcesOption = 0.0
     batch_size: int = 8
     """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding."""
     num_glb: int = 0

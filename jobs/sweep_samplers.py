@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption, ModelOption
+from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, ModelOption, WaitForResourcesOption
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,11 @@ class Config:
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/samplers)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     num_actors: int = 1
     """Number of pipelines that run in parallel; use one per GPU."""
+    gpus: GpusOption = None
+    wait_for_resources_s: WaitForResourcesOption = 0.0
 
 
 if __name__ == "__main__":

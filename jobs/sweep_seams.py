@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import run
-from jobs.support.options import GenerationOptions, IfBusyOption
+from jobs.support.options import GenerationOptions, IfBusyOption, LogFormatOption
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class Config(GenerationOptions):
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/sweep-seams)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     batch_size: int = 4
     """Number of blocks of a scene per batch; the batch size changes the result only by rounding."""
 

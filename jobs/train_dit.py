@@ -18,7 +18,7 @@ from typing import Literal
 import tyro
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption
+from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, WaitForResourcesOption
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,14 @@ class Config:
     output: str = ""
     """Directory to write the trained pipeline to (default: $PRITTI_HOME/models/pritti-<name or preset>)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
+    min_workers: int = 0
+    """Number of workers with which training goes on if nodes are lost; it grows again to --num-workers when nodes
+    return (default: --num-workers)."""
+    gpus: GpusOption = None
+    wait_for_resources_s: WaitForResourcesOption = 0.0
     start_from: str = ""
     """Initialise with the weights of this pipeline; all values that --model of other jobs accepts are valid (default:
     random weights)."""

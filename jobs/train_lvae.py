@@ -22,7 +22,7 @@ from typing import Literal
 import tyro
 
 from jobs.support.cli import run
-from jobs.support.options import IfBusyOption
+from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, WaitForResourcesOption
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,17 @@ class Config:
     output: str = ""
     """Directory to write the trained model to (default: $PRITTI_HOME/models/<name>)."""
     if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
     train_object_decoder_of: str = ""
     """Train only a new object decoder, for this pipeline; all values that --model of other jobs accepts are valid
     (default: train all parts)."""
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
+    min_workers: int = 0
+    """Number of workers with which training goes on if nodes are lost; it grows again to --num-workers when nodes
+    return (default: --num-workers)."""
+    gpus: GpusOption = None
+    wait_for_resources_s: WaitForResourcesOption = 0.0
     steps: int | None = None
     """Number of training steps (default: as in the preset)."""
     batch_size: int | None = None

@@ -305,12 +305,13 @@ class Trainer:
         self.ema = {n: p.detach().clone() for n, p in self.parameters.items()} if settings.ema_decay else None
         self.steps_done = 0
 
-    def step(self, arrays: dict[str, Tensor], positions: Iterable[int]) -> dict[str, Tensor]:
+    def step(self, arrays: dict[str, Tensor], positions: Iterable[int], weight: float = 1.0) -> dict[str, Tensor]:
         """Perform one optimisation step on a local batch.
 
         Args:
             arrays: Batch of this worker.
             positions: Position in the global batch of each sample in `arrays`.
+            weight: Factor of the gradient: the size of this batch, divided by the mean size over all workers.
 
         Returns:
             Detached losses by name. `grad_norm` is the gradient norm.
@@ -335,7 +336,7 @@ class Trainer:
                 losses = self._compute_losses(self.wrapped, {k: v[part] for k, v in arrays.items()}, positions[part])
                 if losses is None:
                     raise NonFiniteLossError(self.steps_done, self._find_nonfinite_samples(arrays, positions))
-                (share * losses["loss"]).backward()
+                (share * weight * losses["loss"]).backward()
             for name, value in losses.items():
                 totals[name] = totals.get(name, 0) + share * value.detach()
         norm = nn.utils.clip_grad_norm_(self.parameters.values(), self.settings.grad_clip or math.inf)

@@ -14,13 +14,13 @@ from statistics import median
 
 import pyarrow as pa
 import torch
-from rich.progress import Progress
 from torch.utils.flop_counter import FlopCounterMode
 
 from jobs.ablate_lvae import Augmentation, Branches, Decoders, Encoding, Ground
 from jobs.implementation.train_lvae import prepare
 from jobs.support.cli import resolve_path
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from jobs.support.terminal import print_table
 from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun, fit
@@ -43,7 +43,16 @@ from pipelines.training.latents import load_lvae
 
 TIMING_STEPS = 60
 # Options that may change between runs of a study.
-NOT_RECORDED = ("num_seeds", "only_variants", "num_workers", "output", "if_busy")
+NOT_RECORDED = (
+    "num_seeds",
+    "only_variants",
+    "num_workers",
+    "gpus",
+    "wait_for_resources_s",
+    "output",
+    "if_busy",
+    "log_format",
+)
 RECORDED_AS = {"max_scenes": "limit", "num_checkpoints": "checks"}  # keys in study.json
 
 
@@ -56,9 +65,9 @@ def compare_encodings(config: Encoding) -> str:
     settings = StudyConfig(config.epochs, config.batch_size, config.learning_rate)
     trials = plan_trials(config)
     guard_study(output, asdict(settings) | {"test": config.num_test_boxes})
-    with hold_output(output, "ablation", config.if_busy):
+    with hold_output(output, "ablation", config):
         tracker = Tracker.start("pritti-ablation", "encoding", asdict(config), storage.join_uri(output, "mlflow.json"))
-        with Progress() as bar:
+        with JobProgress() as bar:
             shown = bar.add_task("train autoencoders", total=len(trials))
             scores = ablation.reconstruct_boxes(
                 trials,
@@ -130,7 +139,7 @@ def compare_variants(config: Branches) -> str:
     find_preset(LVAE_PRESETS, config.preset)
     chosen = select_variants(config)
     guard_study(output, {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED})
-    with hold_output(output, "ablation", config.if_busy):
+    with hold_output(output, "ablation", config):
         tracker = Tracker.start("pritti-ablation", config.name, asdict(config), storage.join_uri(output, "mlflow.json"))
         scores = []
         for seed in range(config.num_seeds):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from rich.progress import Progress
-
 from jobs.edit_scenes import (
     Duplicate,
     Relabel,
@@ -18,6 +16,7 @@ from jobs.edit_scenes import (
 )
 from jobs.support.cli import make_absolute
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import select_scenes
 from jobs.support.terminal import print_table
 from jobs.support.value_names import EDIT_FRAMES
@@ -76,7 +75,7 @@ def edit_scenes(config: SelectOptions | Replay) -> batch_edit.EditResult:
         step.check()
     selection = select_scenes(config)
     total = sum(len(rows) for _, rows in selection.shards())
-    with hold_output(config.output_directory(), f"edited-{config.run}", config.if_busy), Progress() as bar:
+    with hold_output(config.output_directory(), f"edited-{config.run}", config), JobProgress() as bar:
         shown = bar.add_task("edit scenes", total=total)
         request = batch_edit.EditRequest(tuple(edits), config.output_directory(), config.run)
         return batch_edit.edit_scenes(request, selection, config.num_examples, lambda count: bar.advance(shown, count))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from rich.progress import Progress
-
 from jobs.encode_latents import Config
 from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from pipelines.schema.dataset import Dataset
 from pipelines.training.latents import encode_latents
 
@@ -16,7 +15,7 @@ def encode(config: Config) -> dict:
     dataset = Dataset.open(resolve_path(config.dataset, "datasets", "town"))
     lvae = resolve_path(config.lvae, "models", "lvae-town")
     output = make_absolute(config.output) if config.output else dataset.root
-    with hold_output(output, "latents", config.if_busy), Progress() as bar:
+    with hold_output(output, "latents", config), JobProgress() as bar:
         shown = bar.add_task("encode latents", total=sum(dataset.scenes.values()))
         return encode_latents(
             dataset,

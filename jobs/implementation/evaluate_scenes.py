@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from jobs.evaluate_scenes import Config
@@ -15,6 +14,7 @@ from jobs.implementation.protocols import PROTOCOLS, apply_protocol
 from jobs.support.cli import home_path, make_absolute, resolve_path
 from jobs.support.lite0 import prepare_lite0
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from jobs.support.scores import publish_scores
 from jobs.support.value_names import REFERENCES
 from models.pretrained import INDEX_NAME
@@ -68,8 +68,8 @@ def evaluate(config: Config) -> dict:
     output = resolve_path(config.output, "evaluations", config.run or "latest")
     scores: dict = {}
     sides = select_sides(config, dataset) if wanted else {}
-    with hold_output(output, "evaluation", config.if_busy):
-        with Progress() as bar:
+    with hold_output(output, "evaluation", config):
+        with JobProgress() as bar:
             if config.lvae and dataset is not None:
                 scores["reconstruction"] = score_reconstruction(config, dataset, output, bar)
             if wanted:
@@ -106,7 +106,7 @@ def describe_inputs(config: Config, dataset: Dataset | None, sides: dict[str, Sc
 
 
 def evaluate_generation(
-    config: Config, dataset: Dataset | None, sides: dict[str, SceneSet], output: str, bar: Progress
+    config: Config, dataset: Dataset | None, sides: dict[str, SceneSet], output: str, bar: JobProgress
 ) -> dict:
     """Score generated scenes, write evaluation.html, and write the features of each scene to described/."""
     drops_blank = bool(config.protocol) and PROTOCOLS[config.protocol].drops_blank
@@ -172,7 +172,7 @@ def evaluate_generation(
 
 
 def evaluate_streamed(
-    config: Config, dataset: Dataset | None, sides: dict[str, SceneSet], output: str, bar: Progress
+    config: Config, dataset: Dataset | None, sides: dict[str, SceneSet], output: str, bar: JobProgress
 ) -> dict:
     """Compute Frechet distances and the Inception score part by part, and write evaluation.html.
 
@@ -210,7 +210,7 @@ def evaluate_streamed(
     return scores
 
 
-def describe_peers(config: Config, dataset: Dataset | None, output: str, bar: Progress) -> dict:
+def describe_peers(config: Config, dataset: Dataset | None, output: str, bar: JobProgress) -> dict:
     """Return the features of the scenes of other methods, by the last part of their directory's name."""
     if not config.peers or dataset is None:
         return {}
@@ -379,7 +379,7 @@ def read_existence_threshold(lvae: str) -> float:
     return stored.get("existence_threshold", EXISTENCE_THRESHOLD)
 
 
-def score_reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress) -> dict:
+def score_reconstruction(config: Config, dataset: Dataset, output: str, bar: JobProgress) -> dict:
     """Score reconstructions and write reconstruction.parquet and reconstruction.html.
 
     The page shows the scenes with the best and the worst reconstruction.

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from jobs.evaluate_seams import Config
 from jobs.support.cli import resolve_path
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from jobs.support.scores import publish_scores
 from pipelines.evaluation.evaluate import convert_estimates
 from pipelines.evaluation.seams import (
@@ -53,8 +53,8 @@ def evaluate_seams(config: Config) -> dict:
     }
     for selection, _ in sides.values():
         selection.shards()  # raise an error for missing scenes before Ray starts
-    with hold_output(output, "evaluation", config.if_busy):
-        with Progress() as bar:
+    with hold_output(output, "evaluation", config):
+        with JobProgress() as bar:
             measured = {}
             for name, (selection, lines) in sides.items():
                 task = bar.add_task(f"measure {name}", total=sum(len(rows) for _, rows in selection.shards()))

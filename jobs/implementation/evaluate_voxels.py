@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from jobs.evaluate_voxels import Config
 from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from jobs.support.scores import publish_scores
 from pipelines.evaluation.voxel_reconstruction import group_files_by_scene, list_true_scenes, pair_files, score_voxels
 from pipelines.geometry.voxels import VoxelGrid
@@ -28,8 +28,8 @@ def evaluate(config: Config) -> dict:
     stored = group_files_by_scene(make_absolute(config.compressed)) if config.compressed else None
     pairs = pair_files(truth, rebuilt, stored, config.allow_missing)
     output = resolve_path(config.output, "evaluations", "voxels")
-    with hold_output(output, "evaluation", config.if_busy):
-        with Progress() as bar:
+    with hold_output(output, "evaluation", config):
+        with JobProgress() as bar:
             shown = bar.add_task("score voxels", total=len(pairs))
             scores, scenes = score_voxels(pairs, grid, axes, truth_axes, lambda: bar.advance(shown))
         scores["left_out"] = {"truths": len(truth) - len(pairs), "reconstructions": len(rebuilt) - len(pairs)}

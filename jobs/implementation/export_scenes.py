@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from rich.progress import Progress
-
 from jobs.export_scenes import Config
 from jobs.support.cli import make_absolute
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import select_scenes
 from pipelines.io.export import export_scenes
 from pipelines.runtime import storage
@@ -24,8 +23,8 @@ def export(config: Config) -> tuple[str, dict[str, int], dict[str, str]]:
     selection = select_scenes(config)
     output = make_absolute(config.output) if config.output else storage.join_uri(selection.root, "export")
     total = sum(len(rows) for _, rows in selection.shards())
-    with hold_output(output, "export", config.if_busy):
-        with Progress() as bar:
+    with hold_output(output, "export", config):
+        with JobProgress() as bar:
             shown = bar.add_task("export scenes", total=total)
             made = export_scenes(
                 selection, config.formats, output, config.overwrite, lambda count: bar.advance(shown, count)

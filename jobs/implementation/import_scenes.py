@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from rich.progress import Progress
-
 from jobs.import_scenes import Config
 from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from pipelines.io.mesh_import import AUTHORS_AXES
 from pipelines.io.voxel_import import VOXEL_AXES
 from pipelines.preprocess.import_external import ImportRequest, find_files, import_files
@@ -28,8 +27,8 @@ def import_scenes(config: Config) -> tuple[str, dict]:
     base, files = find_files([make_absolute(path) for path in config.files], f".{config.format}")
     output = resolve_path(config.output, "imported", config.name)
     request = ImportRequest(base, files, config.format, axes, output, config.name)
-    with hold_output(output, f"imported-{config.name}", config.if_busy):
-        with Progress() as bar:
+    with hold_output(output, f"imported-{config.name}", config):
+        with JobProgress() as bar:
             shown = bar.add_task("import scenes", total=len(files))
             made = import_files(request, lambda count: bar.advance(shown, count))
         return (request.target if config.format == "npz" else output), made

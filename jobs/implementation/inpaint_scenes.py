@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from rich.progress import Progress
-
 from jobs.implementation.checks import check_inpaint_scenes
 from jobs.inpaint_scenes import Config
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import make_repaint_config, select_scenes
 from pipelines.generation.inpaint import InpaintRequest, RegionConfig, inpaint_scenes
 
@@ -31,7 +30,7 @@ def inpaint(config: Config) -> dict[str, float | None]:
         repaint=make_repaint_config(config),
         guidance_scale=config.guidance_scale,
     )
-    with hold_output(request.output, request.source, config.if_busy), Progress() as bar:
+    with hold_output(request.output, request.source, config), JobProgress() as bar:
         shown = bar.add_task("inpaint", total=total)
         return inpaint_scenes(request, selection, config.num_actors, config.num_examples, lambda: bar.advance(shown))
 

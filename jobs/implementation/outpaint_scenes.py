@@ -11,6 +11,7 @@ from jobs.implementation.checks import check_outpaint_scenes
 from jobs.outpaint_scenes import Config
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import make_repaint_config, select_scenes
 from pipelines.generation.outpaint import HARDLY_KNOWN, OutpaintRequest, outpaint_scenes
 
@@ -62,9 +63,9 @@ def outpaint(config: Config) -> pa.Table:
         order=config.order,
         batch_size=config.batch_size,
     )
-    with hold_output(request.output, request.source, config.if_busy):
+    with hold_output(request.output, request.source, config):
         ahead, behind, left, right = counts
-        with Progress(*Progress.get_default_columns(), MofNCompleteColumn()) as bar:
+        with JobProgress(*Progress.get_default_columns(), MofNCompleteColumn()) as bar:
             shown = bar.add_task("outpaint, blocks", total=count * ((ahead + behind + 1) * (left + right + 1) - 1))
             return outpaint_scenes(request, selection, config.num_actors, lambda blocks: bar.advance(shown, blocks))
 

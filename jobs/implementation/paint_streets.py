@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from rich.progress import Progress
-
 from jobs.paint_streets import Config
 from jobs.support.cli import make_absolute, require_positive, resolve_path
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from pipelines.rendering.controlnet import PhotoRequest, list_drives, paint_streets
 from pipelines.runtime import storage
 
@@ -32,7 +31,7 @@ def paint(config: Config) -> tuple[str, int]:
         control_scale=config.controlnet_conditioning_scale,
         seed=config.seed,
     )
-    with hold_output(streets, "photos", config.if_busy), Progress() as bar:
+    with hold_output(streets, "photos", config), JobProgress() as bar:
         shown = bar.add_task("paint streets", total=len(directories))
         return streets, paint_streets(request, directories, config.num_actors, lambda: bar.advance(shown))
 

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from jobs.implementation.checks import check_preprocess_scenes
 from jobs.preprocess_scenes import Av2, Kitti360, Own, Town
 from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from models.layout import PAPER_SLOTS
 from pipelines.preprocess import sharding
 from pipelines.preprocess.ingest import ingest_drives
 from pipelines.preprocess.sources.town.generator import TOWN_VERSION
 
-NOT_RECORDED = ("output", "skip_unreadable", "if_busy")
+NOT_RECORDED = ("output", "skip_unreadable", "if_busy", "log_format")
 RECORDED_AS = {"make_split": "split"}  # keys in dataset.json
 
 
@@ -53,7 +54,7 @@ def main(config: Town | Kitti360 | Av2 | Own) -> None:
         TextColumn("shards"),
         TimeRemainingColumn(),
     )
-    with hold_output(output, "dataset", config.if_busy), Progress(*columns) as bar:
+    with hold_output(output, "dataset", config), JobProgress(*columns) as bar:
         shown = bar.add_task(f"preprocess {source}", total=len(shards))
         result = ingest_drives(
             shards, output, options, slots, skip_unreadable=skip, on_shard=lambda _: bar.advance(shown)

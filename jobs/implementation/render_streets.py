@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from rich.progress import Progress
-
 from jobs.render_streets import Config
 from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import select_scenes
 from pipelines.rendering.pinhole import Lens
 from pipelines.rendering.street_views import StreetRequest, render_streets
@@ -36,7 +35,7 @@ def render(config: Config) -> dict[str, int]:
         right=config.lateral_offset,
         most=config.max_frames,
     )
-    with hold_output(request.output, f"streets-{config.run}", config.if_busy), Progress() as bar:
+    with hold_output(request.output, f"streets-{config.run}", config), JobProgress() as bar:
         shown = bar.add_task("render streets", total=total)
         return render_streets(request, selection, lambda: bar.advance(shown))
 

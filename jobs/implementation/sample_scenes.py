@@ -9,6 +9,7 @@ from jobs.sample_scenes import Config
 from jobs.support.cli import resolve_path
 from jobs.support.model_directories import find_pipeline_directory, read_label_kind
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from models.labels import LABELS
 from pipelines.generation.sample import SampleRequest, sample_scenes
 from pipelines.io.mesh_export import export_glb
@@ -37,9 +38,9 @@ def sample(config: Config) -> str:
         repair=config.repair,
         shard_scenes=min(64, max(1, -(-config.num_scenes // 8))),
     )
-    with hold_output(output, request.source, config.if_busy):
+    with hold_output(output, request.source, config):
         columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TaskProgressColumn(show_speed=True))
-        with Progress(*columns) as bar:
+        with JobProgress(*columns) as bar:
             shown = bar.add_task("sample scenes", total=config.num_scenes)
             sample_scenes(request, config.num_actors, config.batch_size, lambda row: bar.advance(shown, row["scenes"]))
         for scene in read_scenes(output, f"generated-{config.run}", limit=config.num_glb) if config.num_glb else ():

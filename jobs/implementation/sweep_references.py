@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pyarrow as pa
-from rich.progress import Progress
 
 from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from jobs.support.terminal import print_table
 from jobs.sweep_references import Config
 from pipelines.evaluation.features import FeatureConfig, compute_scene_features
@@ -34,9 +34,9 @@ def run_sweep(config: Config) -> list[dict]:
     }
     parts = {name: side.shards() for name, side in sides.items()}
     looks = FeatureConfig(config.supersample, config.inception and make_absolute(config.inception))
-    with hold_output(output, "evaluation", config.if_busy):
+    with hold_output(output, "evaluation", config):
         features = {}
-        with Progress() as bar:
+        with JobProgress() as bar:
             for name, side in sides.items():
                 task = bar.add_task(f"describe {name}", total=sum(len(rows) for _, rows in parts[name]))
                 directory = storage.join_uri(output, "described", name)

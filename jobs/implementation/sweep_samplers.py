@@ -6,12 +6,12 @@ from dataclasses import replace
 from itertools import product
 
 import pyarrow as pa
-from rich.progress import Progress
 
 from jobs.support.cli import require_positive, resolve_path
 from jobs.support.lite0 import prepare_lite0
 from jobs.support.model_directories import find_pipeline_directory, read_label_kind
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from jobs.support.terminal import print_table
 from jobs.sweep_samplers import Config
 from models.labels import LABELS
@@ -71,8 +71,8 @@ def sweep_samplers(config: Config) -> list[dict]:
     others = replace(others, limit=count)
     labels = LABELS[read_label_kind(model)]
     rows, pictures = [], []
-    with hold_output(output, "evaluation", config.if_busy):
-        with Progress() as bar:
+    with hold_output(output, "evaluation", config):
+        with JobProgress() as bar:
             looks = FeatureConfig(lite0=prepare_lite0())
 
             def described(side: SceneSubset, name: str, control: str = "") -> dict:
@@ -121,7 +121,7 @@ def sweep_samplers(config: Config) -> list[dict]:
         return rows
 
 
-def sample_and_time(config: Config, request: SampleRequest, bar: Progress) -> float | None:
+def sample_and_time(config: Config, request: SampleRequest, bar: JobProgress) -> float | None:
     """Generate missing scenes; return the seconds that one actor needs per scene (None if no shard was timed)."""
     record = storage.join_uri(request.output, "times", f"{request.run}.json")
     times = storage.read_json(record) if storage.exists(record) else {}

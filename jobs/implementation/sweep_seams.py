@@ -5,11 +5,11 @@ from __future__ import annotations
 from itertools import product
 
 import pyarrow as pa
-from rich.progress import Progress
 
 from jobs.support.cli import require_positive, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.outputs import hold_output
+from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import select_scenes
 from jobs.support.terminal import print_table
 from jobs.sweep_seams import Config
@@ -46,8 +46,8 @@ def sweep_seams(config: Config) -> list[dict]:
     real = SceneSubset(resolve_path(config.real, "datasets", "town"), None, config.real_split, config.max_real_scenes)
     real.shards()  # raise an error for missing scenes before hours of outpainting
     rows, pictures = [], []
-    with hold_output(output, "evaluation", config.if_busy):
-        with Progress() as bar:
+    with hold_output(output, "evaluation", config):
+        with JobProgress() as bar:
             for mode, setting in product(config.neighbour_latents, config.settings):
                 name = "-".join(f"{value:g}" for value in setting) + ("" if mode == "reencode" else f"-{mode}")
                 request = OutpaintRequest(

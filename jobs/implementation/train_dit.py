@@ -205,9 +205,9 @@ def make_run_identity(
 def train(config: Config) -> str:
     """Train and return the pipeline's directory."""
     output = resolve_path(config.output, "models", f"pritti-{config.name or config.preset}")
-    with hold_training(find_run_name(config), output, config.if_busy):
+    with hold_training(find_run_name(config), output, config):
         training, complete = prepare(config)
-        trainer.fit(training, config.num_workers, storage.join_uri(output, "dit"))
+        trainer.fit(training, config.num_workers, storage.join_uri(output, "dit"), config.min_workers)
         return complete(output)
 
 

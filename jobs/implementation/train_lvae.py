@@ -144,9 +144,9 @@ def train(config: Config) -> str:
     """Train a model and return its directory; with --train-object-decoder-of, return the directory of the pipeline."""
     name = find_run_name(config)
     output = resolve_path(config.output, "models", name)
-    with hold_training(name, output, config.if_busy):
+    with hold_training(name, output, config):
         training = prepare(config)
-        trainer.fit(training, config.num_workers, output)
+        trainer.fit(training, config.num_workers, output, config.min_workers)
         if config.train_object_decoder_of:
             return write_updated_pipeline(config.train_object_decoder_of, output, training)
         return output

@@ -14,6 +14,7 @@ from typing import Annotated, get_type_hints
 
 import tyro
 
+from jobs.support.log import use_log_format
 from jobs.support.renames import find_renamed
 
 # Environment variables that Ray reads at import and at start. Variables that the user has set keep their values.
@@ -22,7 +23,6 @@ RAY_ENVIRONMENT = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_TRAIN_ENABLE_PRINT_PATCH": "0",
     "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.5",
-    "RAY_TRAIN_ENABLE_PREEMPTION_WATCHER": "0",
     "RAY_TRAIN_WORKER_GROUP_START_TIMEOUT_S": "300",  # Importing torch takes a minute on a busy machine or slow disk.
     # Without this value, Ray kills the reader process after every read if there are few CPUs. The next reader
     # process then needs 10 s for imports.
@@ -107,6 +107,26 @@ def require_positive(config: object, *names: str) -> None:
             raise ValueError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
 
 
+def read_positive_number(variable: str, default: float) -> float:
+    """Return the number of an environment variable.
+
+    Args:
+        variable: Name of the variable.
+        default: Value if the variable is not set.
+
+    Raises:
+        ValueError: The variable is not a positive number.
+    """
+    text = os.environ.get(variable, "")
+    try:
+        number = float(text or default)
+    except ValueError:
+        number = 0.0
+    if not number > 0:
+        raise ValueError(f"{variable} is {text!r}, expected a number of seconds greater than 0")
+    return number
+
+
 def find_root_cause(error: BaseException) -> BaseException:
     """Return the exception that the user should read. Ray wraps this exception in other exceptions.
 
@@ -163,19 +183,21 @@ def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) ->
     default = {"default": options.DEFAULT} if hasattr(options, "DEFAULT") else {}
     config = tyro.cli(options.Config, args=words, prog=prog, description=options.__doc__, **default)
     set_ray_environment()
-    try:
-        if job in TRACKED:
-            require_tracking_uri()
-        if check := import_check(job):
-            check(config)
-        importlib.import_module(f"jobs.implementation.{job}").main(config)
-    except KeyboardInterrupt as error:
-        sys.exit(f"{error or 'interrupted'}; run the same command again to resume")
-    except Exception as error:
-        cause = find_root_cause(error)
-        if isinstance(cause, (ValueError, OSError)):
-            exit_with_error(str(cause).split("\nFailed to apply UDF transform", 1)[0])  # without Ray's advice
-        raise
+    with use_log_format(getattr(config, "log_format", "text")):
+        try:
+            if job in TRACKED:
+                require_tracking_uri()
+            if check := import_check(job):
+                check(config)
+            importlib.import_module(f"jobs.implementation.{job}").main(config)
+        except KeyboardInterrupt as error:
+            print(f"{error or 'interrupted'}; run the same command again to resume", file=sys.stderr)
+            sys.exit(1)
+        except Exception as error:
+            cause = find_root_cause(error)
+            if isinstance(cause, (ValueError, OSError)):
+                exit_with_error(str(cause).split("\nFailed to apply UDF transform", 1)[0])  # without Ray's advice
+            raise
 
 
 def import_check(job: str) -> Callable[[object], object] | None:

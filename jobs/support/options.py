@@ -25,6 +25,27 @@ IfBusyOption = Annotated[
 ]
 
 
+GpusOption = Annotated[
+    float | None,
+    tyro.conf.arg(
+        help="Number of GPUs per model, that is, per actor or training worker; 0 uses CPUs only (default: 1 if the"
+        " cluster has a GPU)."
+    ),
+]
+WaitForResourcesOption = Annotated[
+    float,
+    tyro.conf.arg(
+        name="wait-for-resources",
+        help="Time in seconds to wait for CPUs and GPUs that the cluster does not have, for example until an autoscaler"
+        " has added nodes; 0 fails with a message.",
+    ),
+]
+LogFormatOption = Annotated[
+    Literal["text", "json"],
+    tyro.conf.arg(help="Format of all lines that the job prints: text, or one JSON object per line."),
+]
+
+
 @dataclass(frozen=True)
 class SceneOptions:
     """Options for the scenes that a job reads from a dataset directory."""
@@ -54,6 +75,8 @@ class GenerationOptions(SceneOptions):
     """Classifier-free guidance scale; 1 switches guidance off."""
     num_actors: int = 1
     """Number of pipelines that run in parallel; use one per GPU."""
+    gpus: GpusOption = None
+    wait_for_resources_s: WaitForResourcesOption = 0.0
 
 
 @dataclass(frozen=True)

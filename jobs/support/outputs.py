@@ -13,13 +13,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-from jobs.support.cli import home_path
+from jobs.support.cli import home_path, read_positive_number
 from jobs.support.ray_session import start_ray
 from models.uris import split_name
+from pipelines.runtime.resources import ResourcePolicy, set_resource_policy
 from pipelines.runtime.shared_storage import require_shared_storage
 from pipelines.schema.lease import LIFETIME_S, IfBusy, Lease, Owner
 
-LIFETIME_VARIABLE = "PRITTI_LEASE_SECONDS"
+LIFETIME_VARIABLE = "PRITTI_LEASE_SECONDS"  # Time after which the lease of a silent job expires.
 JOB_VARIABLE = "RAY_JOB_CONFIG_JSON_ENV_VAR"  # Ray sets this variable in submitted jobs.
 
 
@@ -33,22 +34,6 @@ def find_job_id() -> str:
         return json.loads(os.environ.get(JOB_VARIABLE, "{}"))["metadata"]["job_submission_id"]
     except (ValueError, KeyError, TypeError):
         return ""
-
-
-def find_lifetime_s() -> float:
-    """Return $PRITTI_LEASE_SECONDS, the time after which the lease of a silent job expires.
-
-    Raises:
-        ValueError: The variable is not a positive number.
-    """
-    text = os.environ.get(LIFETIME_VARIABLE, "")
-    try:
-        seconds = float(text or LIFETIME_S)
-    except ValueError:
-        seconds = 0.0
-    if not seconds > 0:
-        raise ValueError(f"{LIFETIME_VARIABLE} is {text!r}, expected a number of seconds greater than 0")
-    return seconds
 
 
 @contextmanager
@@ -94,7 +79,13 @@ def hold_lease(output: str, name: str, if_busy: IfBusy = "refuse") -> Iterator[N
         OSError: The output cannot be written.
     """
     with stop_on_sigterm():
-        lease = Lease(output, name, Owner.of_this_process(find_job_id()), _stop_job, find_lifetime_s())
+        lease = Lease(
+            output,
+            name,
+            Owner.of_this_process(find_job_id()),
+            _stop_job,
+            read_positive_number(LIFETIME_VARIABLE, LIFETIME_S),
+        )
         lease.acquire(if_busy, lambda line: print(line, flush=True))
         state = "failed"
         try:
@@ -109,13 +100,14 @@ def hold_lease(output: str, name: str, if_busy: IfBusy = "refuse") -> Iterator[N
 
 
 @contextmanager
-def hold_output(output: str, name: str, if_busy: IfBusy = "refuse", training: bool = False) -> Iterator[None]:
+def hold_output(output: str, name: str, options: object = None, training: bool = False) -> Iterator[None]:
     """Start Ray, check that all nodes share an output, and hold the right to write to it while the body runs.
 
     Args:
         output: Directory or URI to which this job and its tasks write.
         name: Name of the run or table that is written (`hold_lease`).
-        if_busy: Behaviour if another job writes to the same output (`Lease.acquire`).
+        options: Options of the job. The fields `if_busy` (`Lease.acquire`), `gpus` and `wait_for_resources_s`
+            (`ResourcePolicy`) are used if they exist.
         training: Start Ray with a dashboard (`start_ray`).
 
     Yields:
@@ -125,20 +117,21 @@ def hold_output(output: str, name: str, if_busy: IfBusy = "refuse", training: bo
         ValueError: The output is not shared by all nodes, or another job writes to it.
         OSError: The output cannot be written.
     """
+    policy = ResourcePolicy(getattr(options, "gpus", None), getattr(options, "wait_for_resources_s", 0.0))
     start_ray(training)
     require_shared_storage(output)
-    with hold_lease(output, name, if_busy):
+    with set_resource_policy(policy), hold_lease(output, name, getattr(options, "if_busy", "refuse")):
         yield
 
 
 @contextmanager
-def hold_training(name: str, output: str, if_busy: IfBusy = "refuse") -> Iterator[None]:
+def hold_training(name: str, output: str, options: object = None) -> Iterator[None]:
     """Hold the right to train a run and to write its model while the body runs.
 
     Args:
         name: Name of the run; its checkpoints are in $PRITTI_HOME/runs/<name>.
         output: Directory or URI of the model. Its lease is next to it, because the directory is published.
-        if_busy: Behaviour if another job trains this run or writes this model (`Lease.acquire`).
+        options: Options of the job (`hold_output`).
 
     Yields:
         None.
@@ -147,5 +140,6 @@ def hold_training(name: str, output: str, if_busy: IfBusy = "refuse") -> Iterato
         ValueError: An output is not shared by all nodes, or another job writes to it.
         OSError: An output cannot be written.
     """
-    with hold_output(home_path("runs"), name, if_busy, training=True), hold_lease(*split_name(output), if_busy):
+    if_busy: IfBusy = getattr(options, "if_busy", "refuse")
+    with hold_output(home_path("runs"), name, options, training=True), hold_lease(*split_name(output), if_busy):
         yield

@@ -19,20 +19,27 @@ import ray.train
 import ray.train.torch
 import torch
 from ray import cloudpickle
+from ray.experimental.internal_kv import _internal_kv_get, _internal_kv_put
 from ray.train import Checkpoint, CheckpointConfig, FailureConfig, RunConfig, ScalingConfig
+from ray.train.v2.api.exceptions import WorkerGroupError
 
 from jobs.support.cli import find_root_cause
+from jobs.support.log import print_event
 from jobs.support.model_directories import publish_directory
+from jobs.support.progress import JobProgress
 from jobs.support.ray_session import run_packed, start_ray
 from jobs.support.tracking import Tracker
 from models.training import NonFiniteLossError, OptimizerConfig, Trainer
 from pipelines.runtime import storage
+from pipelines.runtime.resources import count_gpus_per_model, count_room, require_room
 from pipelines.schema.run_guard import guard_options
-from pipelines.training.data_loader import READER_CPUS, Reader, Stream, iterate_batches
+from pipelines.training.data_loader import READER_CPUS, Reader, Stream, iterate_batches, split_batch
 from pipelines.training.latents import digest_weights
 
 Wrap = Callable[[torch.nn.Module], torch.nn.Module]
-RETRIES = 2  # maximum number of restarts from the last checkpoint after worker failures
+RETRIES = 2  # maximum number of restarts without a new checkpoint between them
+TELL_S = 1.0  # time between two messages of rank 0 to the driver
+LINE_S = 60.0  # longest time between two lines of the log, if steps are slower than `log_every` expects
 
 
 @dataclass(frozen=True)
@@ -65,31 +72,43 @@ def convert_to_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
     }
 
 
-def train_worker(run: TrainingRun, threads: int) -> None:
+def count_threads(local_workers: int) -> int:
+    """Return the number of threads for torch: the CPUs of this node, divided by its workers."""
+    node = ray.get_runtime_context().get_node_id()
+    cpus = next(found["Resources"].get("CPU", 1.0) for found in ray.nodes() if found["NodeID"] == node)
+    return max(1, int(cpus) // local_workers)
+
+
+def train_worker(run: TrainingRun) -> None:
     """Train in one worker: read batches, take steps, and regularly log, save a checkpoint and validate."""
     logging.getLogger("ray.train").setLevel(logging.WARNING)
     logging.getLogger("ray.data").setLevel(logging.WARNING)
     context = ray.train.get_context()
     rank, world = context.get_world_rank(), context.get_world_size()
-    torch.set_num_threads(threads)
+    torch.set_num_threads(count_threads(context.get_local_world_size()))
     device = ray.train.torch.get_device()
     wrap = ray.train.torch.prepare_model if world > 1 else lambda model: model
     trainer = run.build(device, wrap)
     if checkpoint := ray.train.get_checkpoint():
         with checkpoint.as_directory() as directory:
             trainer.load(directory)
-    local = run.stream.batch_size // world
-    positions = range(rank * local, (rank + 1) * local)
-    started, logged, waited = time.perf_counter(), trainer.steps_done, 0.0
+    positions = split_batch(run.stream.batch_size, rank, world)
+    weight = len(positions) * world / run.stream.batch_size
+    started, logged, waited, saved = time.perf_counter(), trainer.steps_done, 0.0, False
+    told = -TELL_S
     feed = measure_waiting(iterate_batches(run.stream, run.reader, trainer.steps_done, run.settings.steps, rank, world))
     for batch, seconds in feed:
         waited += seconds
         try:
-            losses = trainer.step(convert_to_tensors(batch), positions)
+            losses = trainer.step(convert_to_tensors(batch), positions, weight)
         except NonFiniteLossError as error:
             raise ValueError(with_scene_ids(error, run.stream)) from error
         step, last = trainer.steps_done, trainer.steps_done == run.settings.steps
-        if rank == 0 and (step % run.log_every == 0 or last):
+        if rank == 0 and (last or time.perf_counter() - told > TELL_S):
+            write_step(run, step)
+            told = time.perf_counter()
+        is_late = time.perf_counter() - started > LINE_S
+        if rank == 0 and (step % run.log_every == 0 or last or is_late):
             elapsed, done = time.perf_counter() - started, step - logged
             metrics = {name: float(value) for name, value in losses.items()} | {
                 "learning_rate": run.settings.at(step - 1)[0],
@@ -104,9 +123,21 @@ def train_worker(run: TrainingRun, threads: int) -> None:
                 flush=True,
             )
             started, logged, waited = time.perf_counter(), step, 0.0
-        if step % run.checkpoint_every == 0 or last:
+        is_lost = step % run.log_every == 0 and not saved and ray.train.get_preemption_info() is not None
+        if step % run.checkpoint_every == 0 or last or is_lost:  # A node will be taken away: save the steps until now.
+            saved = is_lost
             report(run, trainer, rank, float(losses["loss"]))
             started, logged, waited = time.perf_counter(), step, 0.0
+
+
+def write_step(run: TrainingRun, step: int) -> None:
+    """Tell the driver the number of finished steps."""
+    _internal_kv_put(f"pritti-step-{run.tracker.run_id}", str(step), overwrite=True)
+
+
+def read_step(run: TrainingRun) -> int:
+    """Return the number of finished steps that a worker has told, or 0."""
+    return int(_internal_kv_get(f"pritti-step-{run.tracker.run_id}") or 0)
 
 
 def with_scene_ids(error: NonFiniteLossError, stream: Stream) -> str:
@@ -172,40 +203,27 @@ def tag_weights(tracker: Tracker, model: torch.nn.Module, steps: int) -> None:
     tracker.tag("steps", str(steps))
 
 
-def fit(run: TrainingRun, num_workers: int, output: str) -> str:
+def fit(run: TrainingRun, num_workers: int, output: str, min_workers: int = 0) -> str:
     """Train until the last step, and write the model to a directory.
 
     Args:
         run: Training run.
-        num_workers: Number of Ray Train workers.
+        num_workers: Maximum number of Ray Train workers.
+        min_workers: Number of workers with which the training goes on if nodes are lost. 0: `num_workers`.
         output: Directory or URI for the model. The model has the EMA weights if EMA is enabled.
 
     Returns:
         `output`.
 
     Raises:
-        ValueError: The cluster is too small for this number of workers, or a loss is not finite.
+        ValueError: The cluster has no room for the workers, or a loss is not finite.
     """
     start_ray(training=True)
-    scaling = make_scaling_config(num_workers, run.stream.batch_size)
-    threads = max(1, int(ray.cluster_resources()["CPU"]) // num_workers)
-    work = partial(train_worker, run, threads)
-    file_system, path = storage.resolve_uri(run.storage_path)
-    packed = cloudpickle.dumps(work)  # pyright: ignore[reportPrivateImportUsage]
-    trainer = ray.train.torch.TorchTrainer(
-        run_packed,
-        train_loop_config={"packed": packed},
-        scaling_config=scaling,
-        run_config=RunConfig(
-            name=run.name,
-            storage_path=path,
-            storage_filesystem=file_system,
-            checkpoint_config=CheckpointConfig(num_to_keep=2),
-            failure_config=FailureConfig(max_failures=RETRIES),
-        ),
-    )
     try:
-        result = trainer.fit()
+        scaling = make_scaling_config(num_workers, min_workers or num_workers, run.stream.batch_size)
+        with JobProgress() as bar:
+            bar.follow(run.name, run.settings.steps, partial(read_step, run))
+            result = fit_with_retries(run, scaling)
     except KeyboardInterrupt:
         run.tracker.finish("KILLED")
         raise
@@ -224,27 +242,80 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
     return output
 
 
-def make_scaling_config(num_workers: int, batch_size: int) -> ScalingConfig:
-    """Return the resources of the workers; the other CPUs are for the data readers.
+def fit_with_retries(run: TrainingRun, scaling: ScalingConfig) -> ray.train.Result:
+    """Run Ray Train; after RETRIES failures, go on if there is a new checkpoint since the first of them.
 
     Args:
-        num_workers: Number of Ray Train workers.
+        run: Training run.
+        scaling: Number and resources of the workers.
+
+    Returns:
+        Result of Ray Train.
+    """
+    file_system, path = storage.resolve_uri(run.storage_path)
+    packed = cloudpickle.dumps(partial(train_worker, run))  # pyright: ignore[reportPrivateImportUsage]
+    while True:
+        before = find_last_checkpoint(run)
+        trainer = ray.train.torch.TorchTrainer(
+            run_packed,
+            train_loop_config={"packed": packed},
+            scaling_config=scaling,
+            run_config=RunConfig(
+                name=run.name,
+                storage_path=path,
+                storage_filesystem=file_system,
+                checkpoint_config=CheckpointConfig(num_to_keep=2),
+                failure_config=FailureConfig(max_failures=RETRIES),
+            ),
+        )
+        try:
+            return trainer.fit()
+        except WorkerGroupError as error:
+            is_bug = any(isinstance(find_root_cause(part), ValueError) for part in error.worker_failures.values())
+            if is_bug or find_last_checkpoint(run) == before:
+                raise
+            print_event(
+                f"{run.name}: workers failed {RETRIES + 1} times, but there is a new checkpoint; training goes on",
+                {"event": "retry"},
+            )
+
+
+def find_last_checkpoint(run: TrainingRun) -> str:
+    """Return the name of the newest checkpoint of a run, or ""."""
+    names = storage.list_names(storage.join_uri(run.storage_path, run.name), directories=True)
+    return max((name for name in names if name.startswith("checkpoint_")), default="")
+
+
+def make_scaling_config(num_workers: int, min_workers: int, batch_size: int) -> ScalingConfig:
+    """Return the number and the resources of the workers; wait until the cluster has room for `min_workers`.
+
+    The other CPUs are for the data readers.
+
+    Args:
+        num_workers: Maximum number of Ray Train workers.
+        min_workers: Minimum number of workers.
         batch_size: Global batch size over all workers.
 
     Returns:
         Scaling configuration of Ray Train.
 
     Raises:
-        ValueError: The cluster has too few CPUs for the workers, or the batch size is not a multiple of `num_workers`.
+        ValueError: The cluster has no room for the workers, or the batch has fewer samples than there are workers.
     """
-    cpus, gpus = (float(ray.cluster_resources().get(kind, 0)) for kind in ("CPU", "GPU"))
-    per_worker = 1.0 if cpus > 2 * num_workers else 0.5
-    most = int((cpus - READER_CPUS) // per_worker)
-    if not 1 <= num_workers <= most:
-        raise ValueError(f"--num-workers is {num_workers}: this cluster of {cpus:.0f} CPUs can run 1 to {most} workers")
-    if batch_size < 1 or batch_size % num_workers:
-        raise ValueError(f"--batch-size {batch_size} is not a multiple of --num-workers {num_workers}")
-    return ScalingConfig(num_workers=num_workers, use_gpu=gpus >= num_workers, resources_per_worker={"CPU": per_worker})
+    if not 1 <= min_workers <= num_workers:
+        raise ValueError(f"--min-workers {min_workers}, --num-workers {num_workers}: expected 1 <= minimum <= number")
+    if batch_size < num_workers:
+        raise ValueError(f"--batch-size {batch_size} is smaller than --num-workers {num_workers}")
+    gpus, spare = count_gpus_per_model(), {"CPU": READER_CPUS}
+    whole = {"CPU": 1.0} | ({"GPU": gpus} if gpus else {})
+    # On small machines, two workers share a core.
+    need = whole if gpus or count_room(whole, spare) >= num_workers else whole | {"CPU": 0.5}
+    require_room(need, min_workers, f"a training worker (--num-workers {num_workers})", spare)
+    return ScalingConfig(
+        num_workers=num_workers if min_workers == num_workers else (min_workers, num_workers),
+        use_gpu=gpus > 0,
+        resources_per_worker=need,
+    )
 
 
 def guard_run_name(name: str, storage_path: str, identity: dict) -> str:

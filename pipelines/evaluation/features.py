@@ -362,7 +362,7 @@ def compute_scene_features(
 
     if isinstance(side, ImageFile):
         arguments = side.path, ranges, looks, directory
-        rows = map_actors(missing, ImageFeatureExtractor, arguments, num_actors, num_cpus=READER_CPUS)
+        rows = map_actors(missing, ImageFeatureExtractor, arguments, num_actors, READER_CPUS, uses_gpu=False)
     else:
         rows = (
             map_rows(make_numbered_rows(missing), describe_scenes, READER_CPUS, num_actors).iter_rows()

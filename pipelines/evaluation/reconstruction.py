@@ -45,7 +45,8 @@ from pipelines.metrics.reconstruction import (
 from pipelines.metrics.validity import LABEL_MEASURES, compute_validity_rates
 from pipelines.rendering.render import render_3d, render_bev
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import count_gpus_per_actor, flat_map_dataset, make_numbered_rows, map_dataset
+from pipelines.runtime.ray_tasks import flat_map_dataset, make_actor_graph
+from pipelines.runtime.resources import find_device
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
@@ -98,7 +99,7 @@ class Reconstructor:
 
     def __init__(self, chunks: list[Chunk], lvae: str) -> None:
         self.chunks, self.model = chunks, load_lvae(lvae)
-        self.device = "cuda" if torch.cuda.is_available() else "cpu"
+        self.device = find_device()
         self.model.to(self.device)
 
     @torch.no_grad()
@@ -248,17 +249,9 @@ def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
 
 
 def reconstruct_chunks(chunks: list[Chunk], lvae: str, num_actors: int) -> ray.data.Dataset:
-    """Build the graph that reconstructs chunks, with one actor per GPU or with CPU actors that use READER_CPUS each."""
-    per_actor, cluster = count_gpus_per_actor(), ray.cluster_resources()
-    room = int(cluster.get("GPU", 0)) if per_actor else max(1, int(cluster.get("CPU", 1)))
-    return map_dataset(
-        make_numbered_rows(range(len(chunks))),
-        Reconstructor,
-        fn_constructor_args=(chunks, lvae),
-        compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(chunks), room)),
-        num_gpus=per_actor,
-        num_cpus=READER_CPUS,
-    )
+    """Build the graph that reconstructs chunks; tasks with READER_CPUS process its rows."""
+    spare = {"CPU": READER_CPUS}
+    return make_actor_graph(range(len(chunks)), Reconstructor, (chunks, lvae), num_actors, READER_CPUS, spare=spare)
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ from pipelines.generation.sample import (
 )
 from pipelines.io.mesh_export import export_glb
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import count_gpus_per_actor
+from pipelines.runtime.resources import make_model_resources, require_room
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, find_unwritten, require_written
 
@@ -378,12 +378,12 @@ def run_batches(
         num_actors: Maximum number of actors.
         on_blocks: Called with the number of blocks of each finished batch.
     """
+    need = make_model_resources()
     actor = ray.remote(Outpainter).options(
-        num_cpus=1, num_gpus=count_gpus_per_actor(), max_restarts=-1, max_task_retries=MAX_RETRIES
+        num_cpus=need["CPU"], num_gpus=need.get("GPU", 0), max_restarts=-1, max_task_retries=MAX_RETRIES
     )
-    room = int(ray.cluster_resources().get("GPU" if count_gpus_per_actor() else "CPU", 0))
     # A waiting actor would take the CPU or GPU of a killed actor, and the killed actor could not restart.
-    count = min(num_actors, max(len(waiting), len(done)), max(1, room))
+    count = min(num_actors, max(len(waiting), len(done)), require_room(need, 1, "an actor (Outpainter)"))
     workers: list[Any] = [actor.remote(request, chosen) for _ in range(count)]
     try:
         schedule_batches(workers, waiting, done, on_blocks)

@@ -9,7 +9,6 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-import torch
 
 from models.labels import LABELS, compose_label, require_labels
 from models.layout import LayoutSpec
@@ -20,6 +19,7 @@ from pipelines.editing.edit import Repair
 from pipelines.metrics.validity import find_slab_offset_m
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
+from pipelines.runtime.resources import find_device
 from pipelines.schema.run_guard import guard_run
 from pipelines.schema.tables import SCENE_TABLES, Shard, find_unwritten, require_written
 from pipelines.training.latents import digest_weights
@@ -119,7 +119,7 @@ def load_pipeline(directory: str) -> PrITTIPipeline:
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ValueError(f"{directory}: no PrITTI pipeline here ({error}); run jobs/train_dit.py first") from error
     pipeline.set_progress_bar_config(disable=True)
-    return pipeline.to("cuda" if torch.cuda.is_available() else "cpu")
+    return pipeline.to(find_device())
 
 
 def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] = (), **also: object) -> None:

@@ -17,6 +17,7 @@ from pipelines.rendering.render import arrange_contact_sheet, encode_png
 from pipelines.rendering.street_views import ON_SHEET, encode_animation
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
+from pipelines.runtime.resources import find_device
 from pipelines.schema.palette import CLASS_COLORS, EMPTY
 from pipelines.schema.run_guard import find_changed_option
 
@@ -95,7 +96,7 @@ class Painter:
                 f"weights, both in diffusers format with safetensors ({error})"
             ) from error
         self.pipeline.set_progress_bar_config(disable=True)
-        self.pipeline.to("cuda" if torch.cuda.is_available() else "cpu")
+        self.pipeline.to(find_device())
         self.request = request
 
     def paint(self, class_id: np.ndarray) -> np.ndarray:

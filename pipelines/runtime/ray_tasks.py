@@ -10,14 +10,11 @@ import ray
 import ray.data
 from ray.util.annotations import RayDeprecationWarning
 
+from pipelines.runtime.resources import Resources, make_model_resources, require_room
+
 # Number of retries for a task whose worker died. Ray replaces a killed worker. If a shard kills each worker that reads
 # it, the run stops.
 MAX_RETRIES = 20
-
-
-def count_gpus_per_actor() -> int:
-    """Return 1 if the cluster has GPUs, otherwise 0; the machine of the driver itself needs no GPU."""
-    return int(ray.cluster_resources().get("GPU", 0) > 0)
 
 
 def make_numbered_rows(numbers: Sequence[int]) -> ray.data.Dataset:
@@ -68,7 +65,7 @@ def map_rows(
 
 
 def map_actors(
-    numbers: Sequence[int], actor: type, arguments: tuple, num_actors: int, **resources: float
+    numbers: Sequence[int], actor: type, arguments: tuple, num_actors: int, num_cpus: float = 1, uses_gpu: bool = True
 ) -> Iterator[dict]:
     """Yield the rows that actors return for {"id": number}, in order of completion.
 
@@ -79,18 +76,57 @@ def map_actors(
         actor: Actor class. Its instances are called with a row and return a row.
         arguments: Arguments of the constructor.
         num_actors: Maximum number of actors.
-        resources: num_cpus or num_gpus per actor (default: one GPU if the cluster has GPUs).
+        num_cpus: Number of CPUs per actor.
+        uses_gpu: Whether an actor holds a model for a GPU (`count_gpus_per_model`).
 
     Yields:
         Output rows.
+
+    Raises:
+        ValueError: The cluster has no room for one actor.
     """
-    if not numbers:
-        return
-    graph = map_dataset(
+    if numbers:
+        graph = make_actor_graph(numbers, actor, arguments, num_actors, num_cpus, uses_gpu)
+        yield from graph.iter_rows()
+
+
+def make_actor_graph(
+    numbers: Sequence[int],
+    actor: type,
+    arguments: tuple,
+    num_actors: int,
+    num_cpus: float = 1,
+    uses_gpu: bool = True,
+    spare: Resources | None = None,
+) -> ray.data.Dataset:
+    """Make a graph in which actors process {"id": number}.
+
+    The pool starts with the actors that fit on the cluster. It grows when the cluster grows. More actors would wait,
+    and take the places of killed actors and of the tasks that follow.
+
+    Args:
+        numbers: Index of each unit of work.
+        actor: Actor class.
+        arguments: Arguments of the constructor.
+        num_actors: Maximum number of actors.
+        num_cpus: Number of CPUs per actor.
+        uses_gpu: Whether an actor holds a model for a GPU.
+        spare: Resources of a task that processes the rows of the actors.
+
+    Returns:
+        Output rows.
+
+    Raises:
+        ValueError: The cluster has no room for one actor.
+    """
+    need = make_model_resources(num_cpus) if uses_gpu else {"CPU": num_cpus}
+    room = require_room(need, 1, f"an actor ({actor.__name__})", spare)
+    most = min(num_actors, len(numbers))
+    return map_dataset(
         make_numbered_rows(numbers),
         actor,
         fn_constructor_args=arguments,
-        compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(numbers))),
-        **(resources or {"num_gpus": count_gpus_per_actor()}),
+        compute=ray.data.ActorPoolStrategy(min_size=min(most, room), max_size=most),
+        num_cpus=num_cpus,
+        num_gpus=need.get("GPU", 0),
     )
-    yield from graph.iter_rows()

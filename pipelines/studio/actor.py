@@ -14,6 +14,7 @@ import ray
 import ray.exceptions
 from pydantic import BaseModel
 
+from pipelines.runtime.resources import count_gpus_per_model
 from pipelines.studio.limits import StudioLimits
 from pipelines.studio.studio import Answer, Studio, make_json_answer
 
@@ -77,7 +78,7 @@ class ActorBackend:
         """
         actor: Any = ray.remote(StudioActor).options(
             num_cpus=0,
-            num_gpus=1 if ray.cluster_resources().get("GPU") else 0,
+            num_gpus=count_gpus_per_model(),
             max_concurrency=THREADS,
             max_restarts=-1,
             max_pending_calls=MAX_PENDING,

@@ -34,6 +34,7 @@ from pipelines.schema.validation import validate_shard
 WINDOW_SHARDS = 4
 SAMPLES_PER_TASK = 256
 AHEAD = 2  # Number of tasks that read samples in advance, while the training uses the samples of another task.
+READ_HERE_AFTER_S = 60.0  # Time after which a worker reads samples itself, because no task has read them.
 READER_CPUS = 0.5  # With more CPUs per reader, readers and training workers would wait for each other on two cores.
 
 Arrays = dict[str, np.ndarray]
@@ -91,10 +92,24 @@ def shuffle_epoch(counts: tuple[int, ...], seed: int, epoch: int) -> tuple[np.nd
     return np.concatenate(shards), np.concatenate(rows)
 
 
+def split_batch(batch: int, rank: int, world: int) -> range:
+    """Return the positions of a worker's samples in the global batch; the shares differ by at most one sample.
+
+    Args:
+        batch: Global batch size.
+        rank: Rank of the worker.
+        world: Number of workers.
+
+    Returns:
+        Positions.
+    """
+    return range(rank * batch // world, (rank + 1) * batch // world)
+
+
 def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: int, rank: int, world: int) -> Arrays:
     """Read, in order, the samples of one rank in `count` consecutive global batches, beginning with batch `first`."""
     shard, row = stream.positions(first * batch, count * batch)
-    mine = (np.arange(count * batch) % batch) // (batch // world) == rank
+    mine = np.isin(np.arange(count * batch) % batch, split_batch(batch, rank, world))
     shard, row, place = shard[mine], row[mine], first * batch + np.flatnonzero(mine)
     out: Arrays = {}
     for k in np.unique(shard):
@@ -122,24 +137,28 @@ def iterate_batches(
         world: Number of workers.
 
     Yields:
-        Dictionary of read-only arrays, each of shape (batch size / world, ...).
+        Dictionary of read-only arrays, each with the samples of `split_batch`.
 
     Raises:
-        ValueError: The global batch size is not a multiple of the number of workers.
+        ValueError: There are more workers than samples in a batch.
     """
     batch = stream.batch_size
-    if batch % world:
-        raise ValueError(f"batch size {batch} is not a multiple of {world} workers")
-    per_task, local = max(1, SAMPLES_PER_TASK // batch), batch // world
+    if batch < world:
+        raise ValueError(f"batch size {batch} is smaller than the number of workers, {world}")
+    per_task, local = max(1, SAMPLES_PER_TASK // batch), len(split_batch(batch, rank, world))
     reader = ray.remote(num_cpus=READER_CPUS)(read_samples)
     shared = ray.put(stream), ray.put(read)
     firsts, reading = iter(range(start_step, stop_step, per_task)), deque()
     while True:
         for first in islice(firsts, 1 + AHEAD - len(reading)):
-            reading.append(reader.remote(*shared, first, min(per_task, stop_step - first), batch, rank, world))
+            part = first, min(per_task, stop_step - first), batch, rank, world
+            reading.append((reader.remote(*shared, *part), part))
         if not reading:
             return
-        samples = cast(Arrays, ray.get(reading.popleft()))
+        task, part = reading.popleft()
+        done, _ = ray.wait([task], timeout=READ_HERE_AFTER_S)
+        # Without room for reading tasks, the training would wait for them, and they for the training.
+        samples = cast(Arrays, ray.get(task)) if done else read_samples(stream, read, *part)
         for start in range(0, len(next(iter(samples.values()))), local):
             yield {name: values[start : start + local] for name, values in samples.items()}
 

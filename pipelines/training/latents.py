@@ -14,6 +14,7 @@ from models.lvae import LayoutVAE
 from models.tensors import make_layout_batch
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
+from pipelines.runtime.resources import find_device
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import Shard, find_shards, make_latents_schema
 
@@ -45,7 +46,7 @@ class Encoder:
     def __init__(self, lvae: str, output: str, shards: list[Shard], there: set[str], batch_size: int) -> None:
         self.model, self.output, self.shards, self.batch_size = load_lvae(lvae), output, shards, batch_size
         self.there = there  # Files of an interrupted run.
-        self.device = "cuda" if torch.cuda.is_available() else "cpu"
+        self.device = find_device()
         self.model.to(self.device)
 
     @torch.no_grad()

@@ -121,7 +121,7 @@ def test_train_lvae_resumes_after_worker_kill(home, tmp_path):
     assert all((whole[k] == resumed[k]).all() for k in whole)
 
 
-def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monkeypatch):
+def test_train_dit_with_three_workers_matches_one_and_resumes(home, tmp_path, monkeypatch):
     import jobs.support.trainer
     from jobs.implementation.train_dit import prepare, train
     from jobs.support.trainer import fit
@@ -140,27 +140,30 @@ def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monk
         return {}, {}
 
     monkeypatch.setattr(jobs.support.trainer, "RETRIES", 0)
-    run, _ = prepare(Config(preset="smoke", name="dit-two", num_workers=2, checkpoint_every=2))
+    run, _ = prepare(Config(preset="smoke", name="dit-three", num_workers=3, checkpoint_every=2))
     assert run.stream.batch_size == 8
     with pytest.raises(Exception, match="stopped"):
-        fit(replace(run, validate=stop_at_four), 2, str(home / "models/two"))
-    fit(replace(run, validate=record_step), 2, str(home / "models/two"))
+        fit(replace(run, validate=stop_at_four), 3, str(home / "models/three"))  # shares of 2, 3 and 3 samples
+    fit(replace(run, validate=record_step), 3, str(home / "models/three"))
     assert seen.read_text().split() == [
         "4",
         "6",
         "8",
     ]  # training resumes at step 2, and the hook runs at steps 4, 6 and 8
-    one, two = load_weights(home / "models/pritti-smoke/dit"), load_weights(home / "models/two")
+    one, three = load_weights(home / "models/pritti-smoke/dit"), load_weights(home / "models/three")
     for name in one:
-        assert np.allclose(one[name], two[name], atol=1e-4), name
+        assert np.allclose(one[name], three[name], atol=1e-4), name
     assert not list((home / "runs").rglob("*.pkl"))
-    with pytest.raises(ValueError, match=r"--num-workers is 4: this cluster of 2 CPUs can run 1 to 3 workers"):
+    with pytest.raises(
+        ValueError,
+        match=r"a training worker \(--num-workers 4\) needs 0.5 CPU 4 times, but this cluster has room for 3: 1 node",
+    ):
         train(Config(preset="smoke", name="dit-four", num_workers=4))
-    with pytest.raises(ValueError, match="--batch-size 7 is not a multiple of --num-workers 2"):
-        train(Config(preset="smoke", name="dit-odd", num_workers=2, batch_size=7))
+    with pytest.raises(ValueError, match="--batch-size 1 is smaller than --num-workers 2"):
+        train(Config(preset="smoke", name="dit-odd", num_workers=2, batch_size=1))
 
 
-@pytest.mark.slow  # test_train_dit_with_two_workers_matches_one_and_resumes uses the same trainer.
+@pytest.mark.slow  # test_train_dit_with_three_workers_matches_one_and_resumes uses the same trainer.
 def test_train_lvae_with_two_workers_matches_one(home):
     from jobs.implementation.train_lvae import train
     from jobs.train_lvae import Config

@@ -1,0 +1,130 @@
+"""Tests of jobs on clusters that grow, lose nodes or have too few of them."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from helpers import ROOT
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+from raylets import Cluster, kill_family, run_cluster
+
+TRAIN = [sys.executable, str(ROOT / "jobs/train_lvae.py"), "smoke"]
+SAMPLE = [sys.executable, str(ROOT / "jobs/sample_scenes.py"), "--num-scenes", "2", "--num-inference-steps", "2"]
+
+AUTOSCALE = """
+import sys
+from ray.cluster_utils import AutoscalingCluster
+types = {"worker": {"resources": {"CPU": 2}, "node_config": {}, "min_workers": 0, "max_workers": 1}}
+cluster = AutoscalingCluster({"CPU": 1}, types, idle_timeout_minutes=5)
+cluster.start()
+print("started", flush=True)
+sys.stdin.read()
+cluster.shutdown()
+"""
+
+
+@pytest.fixture
+def folder() -> Path:
+    """A folder with a short path, as Ray's sockets need."""
+    path = Path(os.environ.get("TMPDIR", "/tmp")) / f"pritti-{os.getpid()}-{time.monotonic_ns() % 10**6}"
+    path.mkdir()
+    return path
+
+
+def make_environment(tmp_path: Path, **more: str) -> dict[str, str]:
+    environment = os.environ | {"PRITTI_HOME": str(tmp_path / "home"), "RAY_AUTH_MODE": "disabled"} | more
+    for name in ("RAY_ADDRESS", "MLFLOW_TRACKING_URI"):
+        environment.pop(name, None)
+    return environment
+
+
+def test_gpus_that_torch_cannot_use_are_an_error(folder, tmp_path):
+    with run_cluster(Cluster(folder, None, make_environment(tmp_path)), 1, num_gpus=1) as cluster:
+
+        def sample(*words: str) -> subprocess.CompletedProcess:
+            command = [*SAMPLE, "--output", str(tmp_path / "made"), *words]
+            return subprocess.run(command, env=cluster.environment, capture_output=True, text=True, timeout=200)
+
+        without = sample()
+        assert without.returncode == 2
+        assert re.search(r"error: node [\d.]+: Ray assigned GPU 0, but torch .* finds no CUDA device", without.stderr)
+        more = sample("--gpus", "2")
+        assert more.returncode == 2 and "needs 1 CPU and 2 GPU 1 times, but this cluster has room for 0" in more.stderr
+        assert sample("--gpus", "0", "--log-format", "json").returncode == 0
+
+
+def test_stopped_training_is_killed_in_mlflow_and_resumes(tmp_path):
+    from jobs.support.tracking import make_client
+
+    environment = make_environment(tmp_path)
+
+    def start() -> subprocess.Popen:
+        words = [*TRAIN, "--steps", "4000", "--checkpoint-every", "20"]
+        return subprocess.Popen(
+            words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1
+        )
+
+    def wait_for(process: subprocess.Popen, pattern: str) -> str:
+        lines = []
+        for line in process.stdout:
+            lines.append(line)
+            if re.search(pattern, line):
+                return line
+        raise AssertionError("".join(lines[-50:]))
+
+    first = start()
+    try:
+        wait_for(first, r"step 80/4000")
+        second = subprocess.run([*TRAIN, "--steps", "4000"], env=environment, capture_output=True, text=True)
+        assert second.returncode == 2 and "writes 'lvae-smoke' here" in second.stderr  # never two trainings of a run
+        first.send_signal(signal.SIGTERM)
+        rest = first.communicate(timeout=60)[0]
+        assert first.returncode == 1 and "the job was stopped (SIGTERM); run the same command again to resume" in rest
+    finally:
+        kill_family(first)
+    api = make_client(f"sqlite:///{tmp_path}/home/mlflow.db")
+
+    def read_run():
+        (run,) = api.search_runs([api.get_experiment_by_name("pritti-lvae").experiment_id])
+        return run
+
+    assert read_run().info.status == "KILLED"
+    again = start()
+    try:
+        line = wait_for(again, r"step \d+/4000")
+        assert int(re.search(r"step (\d+)/", line)[1]) > 80
+        assert read_run().info.status == "RUNNING"
+        again.send_signal(signal.SIGKILL)
+    finally:
+        kill_family(again)
+    assert read_run().info.status == "RUNNING"  # a killed driver cannot change it; the next start closes it
+
+
+def test_missing_nodes_come_from_the_autoscaler(folder, tmp_path):
+    environment = make_environment(tmp_path, RAY_TMPDIR=str(folder), PYTHONPATH=str(ROOT), RAY_FAKE_CLUSTER="1")
+    command = [sys.executable, "-c", AUTOSCALE]
+    autoscaler = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        while "started" not in (line := autoscaler.stdout.readline()):
+            assert line, "the cluster did not start"
+        environment["RAY_ADDRESS"] = "auto"
+        words = [*SAMPLE, "--output", str(tmp_path / "made")]
+        code = (
+            "import sys, ray\nfrom pipelines.runtime.resources import *\nray.init()\n"
+            "with set_resource_policy(ResourcePolicy(wait_s=float(sys.argv[1]))):\n"
+            "    print('room', require_room({'CPU': 2}, 1, 'an actor'))"
+        )
+        refused = subprocess.run([sys.executable, "-c", code, "0"], env=environment, capture_output=True, text=True)
+        assert "needs 2 CPU 1 times, but this cluster has room for 0" in refused.stderr
+        found = subprocess.run([sys.executable, "-c", code, "90"], env=environment, capture_output=True, text=True)
+        assert "room 1" in found.stdout, found.stdout + found.stderr
+        assert "waiting for 2 CPU 1 times (an actor): 1 node with 1 CPU" in found.stdout
+        assert subprocess.run(words, env=environment, capture_output=True).returncode == 0
+    finally:
+        kill_family(autoscaler)
