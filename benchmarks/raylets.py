@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -126,14 +127,31 @@ class Cluster:
     num_cpus: int = 1
     num_gpus: int = 0
 
-    def start(self, num_raylets: int, num_cpus: int = 1, num_gpus: int = 0, dashboard: bool = False) -> None:
-        """Start the head and further raylets, each with `num_cpus` CPUs; `num_gpus` GPUs exist by name only."""
-        port = find_free_port()
+    def start(
+        self,
+        num_raylets: int,
+        num_cpus: int = 1,
+        num_gpus: int = 0,
+        dashboard: bool = False,
+        head_words: Sequence[str] = (),
+        port: int = 0,
+    ) -> None:
+        """Start the head and further raylets.
+
+        Args:
+            num_raylets: Number of nodes, including the head.
+            num_cpus: Number of CPUs of each node.
+            num_gpus: Number of GPUs of each node, which exist by name only.
+            dashboard: Also start the dashboard, which accepts jobs.
+            head_words: Further words of the command that starts the head.
+            port: Port of the head. 0: a free port.
+        """
+        port = port or find_free_port()
         self.num_raylets, self.num_cpus, self.num_gpus = num_raylets, num_cpus, num_gpus
         for name in ("RAY_ADDRESS", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
             self.environment.pop(name, None)
         self.environment |= {"RAY_AUTH_MODE": "disabled", "RAY_TMPDIR": str(self.folder), "PYTHONPATH": str(ROOT)}
-        head = ["--head", "--port", str(port), f"--include-dashboard={dashboard}".lower()]
+        head = ["--head", "--port", str(port), f"--include-dashboard={dashboard}".lower(), *head_words]
         if dashboard:
             self.dashboard_port = find_free_port()
             head += ["--dashboard-port", str(self.dashboard_port)]
@@ -184,7 +202,7 @@ class Cluster:
 
 
 @contextmanager
-def run_cluster(cluster: Cluster, num_raylets: int, **options: bool | int) -> Iterator[Cluster]:
+def run_cluster(cluster: Cluster, num_raylets: int, **options: Any) -> Iterator[Cluster]:
     """Start a cluster, and stop it when the body ends."""
     try:
         cluster.start(num_raylets, **options)

@@ -191,7 +191,7 @@ def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) ->
                 check(config)
             importlib.import_module(f"jobs.implementation.{job}").main(config)
         except KeyboardInterrupt as error:
-            print(f"{error or 'interrupted'}; run the same command again to resume", file=sys.stderr)
+            print(f"{str(error) or 'interrupted'}; run the same command again to resume", file=sys.stderr)
             sys.exit(1)
         except Exception as error:
             cause = find_root_cause(error)

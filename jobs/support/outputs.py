@@ -43,12 +43,20 @@ def stop_on_sigterm() -> Iterator[None]:
         yield
         return
 
+    reason = ""
+
     def stop(signum: int, frame: FrameType | None) -> None:
-        raise JobStopped(_reasons.pop() if _reasons else "the job was stopped (SIGTERM)")
+        nonlocal reason
+        reason = _reasons.pop() if _reasons else "the job was stopped (SIGTERM)"
+        raise JobStopped(reason)
 
     before = signal.signal(signal.SIGTERM, stop)
     try:
         yield
+    except KeyboardInterrupt as error:
+        if reason and not isinstance(error, JobStopped):  # Ray Train raises another KeyboardInterrupt.
+            raise JobStopped(reason) from error
+        raise
     finally:
         signal.signal(signal.SIGTERM, before)
 

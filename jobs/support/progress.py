@@ -26,6 +26,7 @@ WAITING_S = 30.0  # Time after which actors without room are announced; repeated
 STALL_S = 600.0
 STALL_VARIABLE = "PRITTI_STALL_SECONDS"
 POLL_S = 5.0
+EARLIER_S = 0.5  # Units that arrive in this time were finished by an earlier run.
 SHOWN_TASKS = 5
 
 
@@ -41,16 +42,16 @@ class Track:
 
     def __init__(self, name: str, total: float | None, clock: Callable[[], float]) -> None:
         self.name, self.total, self.clock = name, total, clock
-        self.done, self.at_start, self.rejects = 0.0, 0.0, 0
+        self.done, self.at_start, self.rejects, self.is_followed = 0.0, 0.0, 0, False
         self.started = self.advanced = clock()
 
     def advance(self, amount: float) -> None:
         if amount <= 0:
             return
         now = self.clock()
-        # The first units may be those of an earlier run. They say nothing about the rate.
-        if self.done == 0 or now - self.started < 1.0:
-            self.at_start, self.started = self.done + amount, now
+        if now - self.started < EARLIER_S or (self.is_followed and not self.done):
+            # Units of an earlier run say nothing about the rate.
+            self.at_start, self.started = self.done + amount, now if self.is_followed else self.started
         self.done += amount
         self.advanced = now
 
@@ -180,6 +181,7 @@ class JobProgress(Progress):
             read: Function that returns the number of finished units.
         """
         task = self.add_task(description, total=total)
+        self.tracks[task].is_followed = True
         self._followed.append((task, read))
 
     def stop(self) -> None:

@@ -90,6 +90,33 @@ def map_actors(
         yield from graph.iter_rows()
 
 
+def defer_errors(actor: type) -> type:
+    """Return an actor class that raises errors of its constructor when it is called.
+
+    Ray replaces an error of a constructor by a text, and starts the actor again.
+
+    Args:
+        actor: Actor class.
+
+    Returns:
+        Class with the same name.
+    """
+
+    def construct(self: Any, *arguments: Any) -> None:
+        self._error = None
+        try:
+            actor.__init__(self, *arguments)
+        except Exception as error:
+            self._error = error
+
+    def call(self: Any, row: dict) -> dict:
+        if self._error is not None:
+            raise self._error
+        return actor.__call__(self, row)
+
+    return type(actor.__name__, (actor,), {"__init__": construct, "__call__": call})
+
+
 def make_actor_graph(
     numbers: Sequence[int],
     actor: type,
@@ -124,7 +151,7 @@ def make_actor_graph(
     most = min(num_actors, len(numbers))
     return map_dataset(
         make_numbered_rows(numbers),
-        actor,
+        defer_errors(actor),
         fn_constructor_args=arguments,
         compute=ray.data.ActorPoolStrategy(min_size=min(most, room), max_size=most),
         num_cpus=num_cpus,

@@ -1,5 +1,6 @@
 """Tests of jobs on clusters that grow, lose nodes or have too few of them."""
 
+import json
 import os
 import re
 import signal
@@ -17,16 +18,23 @@ from raylets import Cluster, kill_family, run_cluster
 TRAIN = [sys.executable, str(ROOT / "jobs/train_lvae.py"), "smoke"]
 SAMPLE = [sys.executable, str(ROOT / "jobs/sample_scenes.py"), "--num-scenes", "2", "--num-inference-steps", "2"]
 
-AUTOSCALE = """
-import sys
-from ray.cluster_utils import AutoscalingCluster
-types = {"worker": {"resources": {"CPU": 2}, "node_config": {}, "min_workers": 0, "max_workers": 1}}
-cluster = AutoscalingCluster({"CPU": 1}, types, idle_timeout_minutes=5)
-cluster.start()
-print("started", flush=True)
-sys.stdin.read()
-cluster.shutdown()
-"""
+NODE = {"resources": {"CPU": 2}, "node_config": {}, "min_workers": 0, "max_workers": 1}
+HEAD = {"resources": {"CPU": 1}, "node_config": {}, "max_workers": 0}
+AUTOSCALER = {  # Ray's provider for tests, which starts nodes as processes of this machine
+    "cluster_name": "test",
+    "max_workers": 1,
+    "provider": {"type": "fake_multinode"},
+    "available_node_types": {"worker": NODE, "ray.head.default": HEAD},
+    "head_node_type": "ray.head.default",
+    "idle_timeout_minutes": 5,
+    "upscaling_speed": 1.0,
+    "file_mounts_sync_continuously": False,
+    **{name: {} for name in ("auth", "docker", "file_mounts")},
+    **{name: [] for name in ("cluster_synced_files", "rsync_exclude", "rsync_filter", "initialization_commands")},
+    **{
+        f"{name}_commands": [] for name in ("setup", "head_setup", "worker_setup", "head_start_ray", "worker_start_ray")
+    },
+}
 
 
 @pytest.fixture
@@ -65,7 +73,7 @@ def test_stopped_training_is_killed_in_mlflow_and_resumes(tmp_path):
     environment = make_environment(tmp_path)
 
     def start() -> subprocess.Popen:
-        words = [*TRAIN, "--steps", "4000", "--checkpoint-every", "20"]
+        words = [*TRAIN, "--steps", "1000", "--checkpoint-every", "20"]
         return subprocess.Popen(
             words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1
         )
@@ -80,8 +88,8 @@ def test_stopped_training_is_killed_in_mlflow_and_resumes(tmp_path):
 
     first = start()
     try:
-        wait_for(first, r"step 80/4000")
-        second = subprocess.run([*TRAIN, "--steps", "4000"], env=environment, capture_output=True, text=True)
+        wait_for(first, r"step 40/1000")
+        second = subprocess.run([*TRAIN, "--steps", "1000"], env=environment, capture_output=True, text=True)
         assert second.returncode == 2 and "writes 'lvae-smoke' here" in second.stderr  # never two trainings of a run
         first.send_signal(signal.SIGTERM)
         rest = first.communicate(timeout=60)[0]
@@ -97,8 +105,8 @@ def test_stopped_training_is_killed_in_mlflow_and_resumes(tmp_path):
     assert read_run().info.status == "KILLED"
     again = start()
     try:
-        line = wait_for(again, r"step \d+/4000")
-        assert int(re.search(r"step (\d+)/", line)[1]) > 80
+        line = wait_for(again, r"step \d+/1000")
+        assert int(re.search(r"step (\d+)/", line)[1]) > 40
         assert read_run().info.status == "RUNNING"
         again.send_signal(signal.SIGKILL)
     finally:
@@ -107,24 +115,24 @@ def test_stopped_training_is_killed_in_mlflow_and_resumes(tmp_path):
 
 
 def test_missing_nodes_come_from_the_autoscaler(folder, tmp_path):
-    environment = make_environment(tmp_path, RAY_TMPDIR=str(folder), PYTHONPATH=str(ROOT), RAY_FAKE_CLUSTER="1")
-    command = [sys.executable, "-c", AUTOSCALE]
-    autoscaler = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    try:
-        while "started" not in (line := autoscaler.stdout.readline()):
-            assert line, "the cluster did not start"
-        environment["RAY_ADDRESS"] = "auto"
-        words = [*SAMPLE, "--output", str(tmp_path / "made")]
+    config = folder / "autoscaler.json"
+    config.write_text(json.dumps(AUTOSCALER))
+    environment = make_environment(tmp_path, RAY_FAKE_CLUSTER="1", AUTOSCALER_UPDATE_INTERVAL_S="1")
+    head = {"head_words": (f"--autoscaling-config={config}",), "port": 6379}  # Ray's provider expects this port
+    with run_cluster(Cluster(folder, None, environment), 1, **head) as cluster:
+        del cluster.environment["RAY_FAKE_CLUSTER"]
+
+        def run(*words: str) -> subprocess.CompletedProcess:
+            return subprocess.run(
+                [sys.executable, *words], cwd=ROOT, env=cluster.environment, capture_output=True, text=True, timeout=200
+            )
+
         code = (
             "import sys, ray\nfrom pipelines.runtime.resources import *\nray.init()\n"
             "with set_resource_policy(ResourcePolicy(wait_s=float(sys.argv[1]))):\n"
             "    print('room', require_room({'CPU': 2}, 1, 'an actor'))"
         )
-        refused = subprocess.run([sys.executable, "-c", code, "0"], env=environment, capture_output=True, text=True)
-        assert "needs 2 CPU 1 times, but this cluster has room for 0" in refused.stderr
-        found = subprocess.run([sys.executable, "-c", code, "90"], env=environment, capture_output=True, text=True)
+        assert "needs 2 CPU 1 times, but this cluster has room for 0" in run("-c", code, "0").stderr
+        found = run("-c", code, "90")
         assert "room 1" in found.stdout, found.stdout + found.stderr
         assert "waiting for 2 CPU 1 times (an actor): 1 node with 1 CPU" in found.stdout
-        assert subprocess.run(words, env=environment, capture_output=True).returncode == 0
-    finally:
-        kill_family(autoscaler)

@@ -154,10 +154,7 @@ def test_train_dit_with_three_workers_matches_one_and_resumes(home, tmp_path, mo
     for name in one:
         assert np.allclose(one[name], three[name], atol=1e-4), name
     assert not list((home / "runs").rglob("*.pkl"))
-    with pytest.raises(
-        ValueError,
-        match=r"a training worker \(--num-workers 4\) needs 0.5 CPU 4 times, but this cluster has room for 3: 1 node",
-    ):
+    with pytest.raises(ValueError, match=r"--num-workers 4\) needs 0.5 CPU 4 times, .* has room for 3: 1 node"):
         train(Config(preset="smoke", name="dit-four", num_workers=4))
     with pytest.raises(ValueError, match="--batch-size 1 is smaller than --num-workers 2"):
         train(Config(preset="smoke", name="dit-odd", num_workers=2, batch_size=1))
