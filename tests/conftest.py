@@ -180,7 +180,7 @@ def smoke(tmp_path_factory, cluster) -> Path:
     from jobs.train_dit import Config
     from pipelines.training.data_loader import iterate_batches
 
-    def fit_here(run, num_workers: int, output: str) -> str:
+    def fit_here(run, num_workers: int, output: str, min_workers: int) -> str:
         trainer = run.build(torch.device("cpu"), lambda model: model)
         for batch in iterate_batches(run.stream, run.reader, 0, run.settings.steps):
             trainer.step(convert_to_tensors(batch), range(run.stream.batch_size))

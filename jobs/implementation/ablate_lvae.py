@@ -222,7 +222,9 @@ def train_variant(config: Branches, variant: str, seed: int, output: str) -> dic
     seconds = time.perf_counter() - started
     root = training.identity["dataset"]
     source = training.stream.shards[0].source
-    reconstruction = evaluate_reconstruction(SceneSubset(root, source, "test", config.max_scenes), model).scores
+    records = storage.join_uri(output, "reconstructed", f"{make_slug(variant)}-seed{seed}")
+    selection = SceneSubset(root, source, "test", config.max_scenes)
+    reconstruction = evaluate_reconstruction(selection, model, records).scores
     described = {"variant": variant, "seed": seed, "steps": steps, "dataset": root}
     trained, example = load_lvae(model), training.stream.shards[0].scenes([0])
     described |= {"parameters": trained.num_parameters(), "training_seconds": seconds}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -34,6 +33,7 @@ from pipelines.evaluation.features import (
     FeatureParts,
     ImageFile,
     SceneSet,
+    StoredFeatures,
     compute_scene_features,
     count_scenes,
     drop_blank,
@@ -117,7 +117,7 @@ def evaluate_generation(
         vgg16=config.vgg16 and make_absolute(config.vgg16),
         blank=drops_blank,
     )
-    described: dict[str, dict[str, np.ndarray]] = {}
+    described: dict[str, StoredFeatures] = {}
     dropped: dict[str, int] = {}
 
     def describe(name: str, side: SceneSet, how: FeatureConfig) -> None:
@@ -125,10 +125,10 @@ def evaluate_generation(
         directory = storage.join_uri(output, "described", name)
         described[name] = compute_scene_features(
             side, dataset, how, directory, config.num_actors, lambda n: bar.advance(task, n)
-        ).read()
+        ).open()
         if drops_blank:
             described[name], dropped[name] = drop_blank(described[name])
-            if (left := len(described[name]["row"])) < 2:
+            if (left := len(described[name]["scene_id"])) < 2:
                 raise ValueError(
                     f"--protocol {config.protocol} drops {dropped[name]} of {dropped[name] + left} pictures of"
                     f" {side.root} ({name}), because they are white or contain a black pixel; at least 2 are needed"
@@ -226,7 +226,7 @@ def describe_peers(config: Config, dataset: Dataset | None, output: str, bar: Jo
             storage.join_uri(output, "described", f"peer-{name}"),
             config.num_actors,
             lambda n, task=task: bar.advance(task, n),
-        ).read()
+        ).open()
     return found
 
 
@@ -390,10 +390,11 @@ def score_reconstruction(config: Config, dataset: Dataset, output: str, bar: Job
     rebuilt = evaluate_reconstruction(
         real,
         lvae,
+        storage.join_uri(output, "reconstructed"),
         config.num_actors,
         voxel_range_m=config.voxel_range_m,
         dataset=dataset,
-        on_scene=lambda: bar.advance(shown),
+        on_scenes=lambda count: bar.advance(shown, count),
         label_threshold=read_existence_threshold(lvae),
     )
     storage.write_parquet(rebuilt.scenes, storage.join_uri(output, "reconstruction.parquet"))

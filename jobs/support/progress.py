@@ -81,9 +81,12 @@ class Track:
         if self.total is not None:
             parts[0] += f" of {self.total:,.0f} ({100 * self.done / max(self.total, 1):.0f} %)"
         parts.append(f"{self.rate:.3g}/s")
-        if left_s is not None:
+        if self.is_complete:
+            parts.append(format_duration(self.clock() - self.started))
+        elif left_s is not None:
             parts.append(f"{format_duration(left_s)} left")
-        parts.append(f"last progress {format_duration(age_s)} ago")
+        if not self.is_complete:
+            parts.append(f"last progress {format_duration(age_s)} ago")
         if self.rejects:
             parts.append(f"{self.rejects:,} rejects")
         return ", ".join(parts), values

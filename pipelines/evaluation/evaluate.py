@@ -12,7 +12,7 @@ reconstruction.py scores reconstructions.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,14 +39,17 @@ from pipelines.metrics.neighbours import (
     compute_ball_radii,
     find_nearest,
     find_within,
+    iterate_blocks,
     judge_neighbours,
     prepare_features,
     require_comparable,
 )
 from pipelines.metrics.relations import RELATION_HISTOGRAMS, RELATIONS
 from pipelines.metrics.two_sample import FOLDS, MIN_SCENES, classify_samples
+from pipelines.runtime.ray_tasks import MAX_RETRIES
 
-Described = Mapping[str, np.ndarray]
+Described = Mapping[str, np.ndarray]  # Arrays, or StoredFeatures that are read when they are used.
+Unit = tuple[Callable[..., dict], tuple]
 ROWS_PER_TASK = 4096
 RELATION_LIMIT = 5.0  # Standardised relation statistics are clipped to this value; rare categories have outliers.
 NEIGHBOURS = 3  # Number of nearest real scenes that are reported per generated scene.
@@ -80,17 +83,45 @@ def compare_datasets(
     Returns:
         Nested scores. Scores with an interval are Estimates.
     """
-    scores: dict[str, Any] = {"scenes": {"real": len(real["scene_id"]), "generated": len(generated["scene_id"])}}
-    scores |= compute_set_scores(real, generated, ground_classes, k)
+    counts = {"real": len(real["scene_id"]), "generated": len(generated["scene_id"])}
+    units = list_set_units(real, generated, ground_classes, k)
     if "statistics" in real and "statistics" in generated:
-        scores |= compute_layout_scores(real, generated, ground_classes)
+        units.append((compute_layout_scores, (real, generated, tuple(ground_classes))))
     if "pool3" in real and "pool3" in generated:
-        if reference:
-            scores["fid"] = compute_frechet_to(reference.pool3, generated["pool3"])
-            scores["sfid"] = compute_frechet_to(reference.spatial, generated["spatial"]) if reference.spatial else None
-        scores["inception_score"] = compute_inception_score(generated["logits"])
-        scores["inception_score_real"] = compute_inception_score(real["logits"])
-    return scores
+        units.append((compute_inception_scores, (real, generated, reference)))
+    return {"scenes": counts} | run_units(units)
+
+
+def list_set_units(
+    real: Described, generated: Described, ground_classes: Sequence[str] = (), k: Sequence[int] = (3,)
+) -> list[Unit]:
+    """List the computations of `compute_set_scores`. They are independent and run as Ray tasks.
+
+    Args:
+        real: Features of the real scenes.
+        generated: Features of the generated scenes, or of a ceiling or control.
+        ground_classes: Names of the ground classes in the layout statistics.
+        k: Neighbourhood sizes of precision and recall.
+
+    Returns:
+        Functions with their arguments; each returns a dictionary of scores.
+    """
+    sides = real, generated
+
+    def both_have(name: str) -> bool:
+        return all(name in side for side in sides)
+
+    units: list[Unit] = []
+    if both_have("statistics"):
+        units += [(compute_statistics_scores, (*sides, name)) for name in ("relation", "layout")]
+        units.append((compute_two_sample_scores, (*sides, tuple(ground_classes))))
+    spaces = {"pool3": ("", {"frechet": "fid", "mmd": "kid"}), "lite0": ("lite0_", {"mmd": "kid"})}
+    for features, (prefix, names) in (spaces | {"random": ("random_", {})}).items():
+        if both_have(features):
+            units.append((compute_space_scores, (*sides, features, prefix, names, tuple(k))))
+    if both_have("spatial"):
+        units.append((compute_spatial_scores, sides))
+    return units
 
 
 def compute_set_scores(
@@ -107,30 +138,87 @@ def compute_set_scores(
     Returns:
         Estimates by name, and `two_sample_features`.
     """
-    scores: dict[str, Any] = {}
-    if "statistics" in real and "statistics" in generated:
-        layout = statistics.standardize_statistics(real["statistics"], generated["statistics"])
-        relations = [
-            part.clip(-RELATION_LIMIT, RELATION_LIMIT)
-            for part in statistics.standardize_statistics(real["relations"], generated["relations"])
-        ]
-        for name, sides in (("relation", relations), ("layout", layout)):
-            scores[f"{name}_frechet"] = estimate_frechet(*sides)
-            scores[f"{name}_mmd"] = compute_kernel_distance(*sides)
-        places = group_places(real["place"]), group_places(generated["place"])
-        if min(map(len, places)) >= MIN_SCENES and min(len(np.unique(side)) for side in places) >= FOLDS:
-            features = [np.concatenate([side["relations"], side["statistics"]], axis=1) for side in (real, generated)]
-            names = [*RELATIONS, *statistics.list_statistic_names(ground_classes)]
-            found = classify_samples(features[0], features[1], names, places)
-            scores |= {"two_sample_auc": found.auc, "two_sample_features": found.features}
-    spaces = {"pool3": ("", {"frechet": "fid", "mmd": "kid"}), "lite0": ("lite0_", {"mmd": "kid"})}
-    for features, (prefix, names) in (spaces | {"random": ("random_", {})}).items():
-        if features in real and features in generated:
-            found = compute_feature_scores(real[features], generated[features], k)
-            scores |= {prefix + names.get(name, name): value for name, value in found.items()}
-    if "spatial" in real and "spatial" in generated:
-        scores["sfid"] = estimate_frechet(real["spatial"], generated["spatial"])
-    return scores
+    return run_units(list_set_units(real, generated, ground_classes, k))
+
+
+def run_units(units: Sequence[Unit]) -> dict[str, Any]:
+    """Run computations as Ray tasks, and merge their dictionaries in order.
+
+    The driver holds neither features nor matrices: a task reads the columns that it uses (`StoredFeatures`).
+
+    Args:
+        units: Functions with their arguments.
+
+    Returns:
+        All scores.
+    """
+    shared: dict[int, Any] = {}
+
+    def share(value: Any) -> Any:
+        if isinstance(value, dict) and any(isinstance(part, np.ndarray) for part in value.values()):
+            return shared.setdefault(id(value), ray.put(value))
+        return value
+
+    tasks = [run_unit.remote(function, *map(share, arguments)) for function, arguments in units]
+    found: dict[str, Any] = {}
+    for part in ray.get(tasks):
+        found |= part
+    return found
+
+
+@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
+def run_unit(function: Callable[..., dict], *arguments: Any) -> dict:
+    return function(*arguments)
+
+
+def standardize_sides(real: Described, generated: Described, name: str) -> Sequence[np.ndarray]:
+    """Return the standardised layout or relation statistics of both sides."""
+    if name == "layout":
+        return statistics.standardize_statistics(real["statistics"], generated["statistics"])
+    parts = statistics.standardize_statistics(real["relations"], generated["relations"])
+    return [part.clip(-RELATION_LIMIT, RELATION_LIMIT) for part in parts]
+
+
+def compute_statistics_scores(real: Described, generated: Described, name: str) -> dict[str, Estimate]:
+    """Compute the Frechet distance and the MMD of layout or relation statistics; `name` is "layout" or "relation"."""
+    sides = standardize_sides(real, generated, name)
+    return {f"{name}_frechet": estimate_frechet(*sides), f"{name}_mmd": compute_kernel_distance(*sides)}
+
+
+def compute_two_sample_scores(real: Described, generated: Described, ground_classes: Sequence[str]) -> dict[str, Any]:
+    """Compute the AUC of the two-sample test; no scores if there are too few scenes or places."""
+    places = group_places(real["place"]), group_places(generated["place"])
+    if min(map(len, places)) < MIN_SCENES or min(len(np.unique(side)) for side in places) < FOLDS:
+        return {}
+    features = [np.concatenate([side["relations"], side["statistics"]], axis=1) for side in (real, generated)]
+    names = [*RELATIONS, *statistics.list_statistic_names(ground_classes)]
+    found = classify_samples(features[0], features[1], names, places)
+    return {"two_sample_auc": found.auc, "two_sample_features": found.features}
+
+
+def compute_space_scores(
+    real: Described, generated: Described, features: str, prefix: str, names: Mapping[str, str], k: Sequence[int]
+) -> dict[str, Estimate]:
+    """Compute `compute_feature_scores` of a column, with a prefix and with other names."""
+    found = compute_feature_scores(real[features], generated[features], k)
+    return {prefix + names.get(name, name): value for name, value in found.items()}
+
+
+def compute_spatial_scores(real: Described, generated: Described) -> dict[str, Estimate]:
+    """Compute sfid."""
+    return {"sfid": estimate_frechet(real["spatial"], generated["spatial"])}
+
+
+def compute_inception_scores(
+    real: Described, generated: Described, reference: ReferenceMoments | None
+) -> dict[str, Estimate | None]:
+    """Compute the Inception score of both sides, and fid and sfid against the moments of all real pictures."""
+    scores: dict[str, Estimate | None] = {}
+    if reference:
+        scores["fid"] = compute_frechet_to(reference.pool3, generated["pool3"])
+        scores["sfid"] = compute_frechet_to(reference.spatial, generated["spatial"]) if reference.spatial else None
+    scores["inception_score"] = compute_inception_score(generated["logits"])
+    return scores | {"inception_score_real": compute_inception_score(real["logits"])}
 
 
 def group_places(places: np.ndarray) -> np.ndarray:
@@ -147,21 +235,6 @@ def group_places(places: np.ndarray) -> np.ndarray:
 
 
 # ------------------------------------------------------------------------------------------- ceiling and controls
-
-
-@ray.remote(num_cpus=1)
-def score_set_task(
-    real: dict[str, np.ndarray], side: dict[str, np.ndarray], ground_classes: Sequence[str], k: Sequence[int]
-) -> dict[str, Estimate]:
-    """Score one set, including the validity measures, as flat Estimates."""
-    scores = {
-        name: value
-        for name, value in compute_set_scores(real, side, ground_classes, k).items()
-        if isinstance(value, Estimate)
-    }
-    if "validity" in side:
-        scores |= {f"validity.{name}": rate for name, rate in rate_validity(side).items() if rate is not None}
-    return scores
 
 
 def rate_validity(side: Described) -> dict[str, Estimate | None]:
@@ -190,9 +263,14 @@ def score_sets(
     Returns:
         Scores of each set. Names of validity measures begin with `validity.`.
     """
-    shared = ray.put(dict(real))
-    tasks = {name: score_set_task.remote(shared, dict(side), ground_classes, k) for name, side in sets.items()}
-    return dict(zip(tasks, ray.get(list(tasks.values())), strict=True))
+    found = {}
+    for name, side in sets.items():
+        scores = compute_set_scores(real, side, ground_classes, k)
+        found[name] = {key: value for key, value in scores.items() if isinstance(value, Estimate)}
+        if "validity" in side:
+            rates = rate_validity(side)
+            found[name] |= {f"validity.{key}": rate for key, rate in rates.items() if rate is not None}
+    return found
 
 
 def measure_badness(name: str, value: float) -> float:
@@ -317,12 +395,21 @@ def split_rows(count: int) -> list[range]:
     return [range(start, min(start + ROWS_PER_TASK, count)) for start in range(0, count, ROWS_PER_TASK)]
 
 
-@ray.remote(num_cpus=1)
+@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
 def compute_radii_task(side: FeatureSet, rows: range, k: Sequence[int]) -> np.ndarray:
     return compute_ball_radii(side, rows, k)
 
 
-@ray.remote(num_cpus=1)
+@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
+def find_nearest_task(
+    side: FeatureSet, others: FeatureSet, rows: range, count: int, themselves: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    parts = [find_nearest(side, others, block, count, themselves) for block in iterate_blocks(rows)]
+    squared, index = zip(*parts, strict=True)
+    return np.concatenate(squared), np.concatenate(index)
+
+
+@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
 def find_within_task(
     real: FeatureSet, generated: FeatureSet, real_balls: np.ndarray, generated_balls: np.ndarray, rows: range
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -338,9 +425,14 @@ def score_nearest_distances(real: Described, generated: Described) -> tuple[str,
         `nearest_distance_lite0`.
     """
     features = next(name for name in NEAREST_FEATURES if name in real and name in generated)
-    found = compute_nearest_distances(real[features], generated[features])
+    found = run_units([(compute_column_distances, (real, generated, features))])
     name = "memorisation" if features == "vgg16" else f"nearest_distance_{features}"
     return name, found | {"features": NEAREST_FEATURES[features]}
+
+
+def compute_column_distances(real: Described, generated: Described, features: str) -> dict:
+    """Run `compute_nearest_distances` with a column of features."""
+    return compute_nearest_distances(real[features], generated[features])
 
 
 def compute_nearest_distances(real: np.ndarray, generated: np.ndarray) -> dict:
@@ -356,9 +448,13 @@ def compute_nearest_distances(real: np.ndarray, generated: np.ndarray) -> dict:
         real samples; the nearest comes first. `distance` (m, 3): distances from each generated sample to these nearest
         real samples.
     """
-    sides = prepare_features(real, generated, (NEIGHBOURS,))
-    squared, index = find_nearest(sides[1], sides[0], range(len(generated)), NEIGHBOURS)
-    own = np.sqrt(find_nearest(sides[0], sides[0], range(len(real)), 1, themselves=True)[0][:, 0])
+    shared = [ray.put(side) for side in prepare_features(real, generated, (NEIGHBOURS,))]
+    tasks = [
+        find_nearest_task.remote(shared[1], shared[0], rows, NEIGHBOURS, False) for rows in split_rows(len(generated))
+    ]
+    own_tasks = [find_nearest_task.remote(shared[0], shared[0], rows, 1, True) for rows in split_rows(len(real))]
+    squared, index = (np.concatenate(part) for part in zip(*ray.get(tasks), strict=True))
+    own = np.sqrt(np.concatenate([part[0][:, 0] for part in ray.get(own_tasks)]))
     distance = np.sqrt(squared)
     found = {}
     for name, values in (("generated", distance[:, 0]), ("real", own)):

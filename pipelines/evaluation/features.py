@@ -7,9 +7,9 @@ An interrupted run therefore resumes with the missing parts.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import pyarrow as pa
@@ -125,16 +125,19 @@ def find_blank_pictures(pictures: np.ndarray) -> np.ndarray:
     return is_white | has_black
 
 
-def drop_blank(described: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int]:
+def drop_blank(described: StoredFeatures) -> tuple[StoredFeatures, int]:
     """Drop the scenes with a mark in the column `blank`.
 
+    Args:
+        described: Features of all scenes of a side.
+
     Returns:
-        Columns of the other scenes, with the column `row` (n,), the position of each scene in the side; and the number
+        Features of the other scenes, with the column `row` (n,), the position of each scene in the side; and the number
         of dropped scenes.
     """
-    kept = np.flatnonzero(described["blank"][:, 0] == 0)
-    found = {name: values[kept] for name, values in described.items() if name != "blank"}
-    return found | {"row": kept}, len(described["blank"]) - len(kept)
+    blank = described["blank"][:, 0]
+    kept = np.flatnonzero(blank == 0)
+    return replace(described, rows=kept), len(blank) - len(kept)
 
 
 def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
@@ -294,12 +297,52 @@ class FeatureParts:
         for number in range(self.count):
             yield read_column(storage.read_parquet(make_part_path(self.directory, number), [name]), name)
 
+    def open(self) -> StoredFeatures:
+        """Return a mapping from the name of a column to its values. A column is read when it is used."""
+        return StoredFeatures(self)
+
     def read(self) -> dict[str, np.ndarray]:
         """Read all parts in order; return scene_id (n,), place (n,) and the other columns (n, width)."""
-        paths = [make_part_path(self.directory, number) for number in range(self.count)]
-        table = pa.concat_tables([storage.read_parquet(path) for path in paths])
-        described = {name: table[name].to_numpy() for name in table.column_names[:2]}
-        return described | {name: read_column(table, name) for name in table.column_names[2:]}
+        return dict(self.open())
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFeatures(Mapping[str, np.ndarray]):
+    """Features of a side, by name of the column. Each access reads a column, so that a process holds only what it uses.
+
+    Attributes:
+        parts: Files of the features.
+        rows: (n,) positions of the scenes to keep. None: all scenes. If it is given, it is also the column `row`.
+    """
+
+    parts: FeatureParts
+    rows: np.ndarray | None = None
+
+    @cached_property
+    def _names(self) -> tuple[str, ...]:
+        names = storage.read_parquet(make_part_path(self.parts.directory, 0)).column_names
+        return (*names, *(("row",) if self.rows is not None else ()))
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._names:
+            raise KeyError(name)
+        if name == "row" and self.rows is not None:
+            return self.rows
+        if name in ("scene_id", "place"):
+            paths = [make_part_path(self.parts.directory, number) for number in range(self.parts.count)]
+            values = np.concatenate([storage.read_parquet(path, [name])[name].to_numpy() for path in paths])
+        else:
+            values = np.concatenate(list(self.parts.iterate_column(name)))
+        return values if self.rows is None else values[self.rows]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
 
 
 def read_column(table: pa.Table, name: str) -> np.ndarray:

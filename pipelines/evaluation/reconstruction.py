@@ -1,17 +1,18 @@
 """Evaluate layout-VAE reconstruction with Ray: actors encode and decode scenes, and tasks score them.
 
-The graph returns one record per scene. Records can be added, and one function computes the scores from the sum.
+The graph writes one record per scene. Records can be added, and one task computes the scores from the sum.
 """
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 
 import numpy as np
 import pyarrow as pa
+import ray
 import ray.data
 import torch
 
@@ -45,12 +46,13 @@ from pipelines.metrics.reconstruction import (
 from pipelines.metrics.validity import LABEL_MEASURES, compute_validity_rates
 from pipelines.rendering.render import render_3d, render_bev
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import flat_map_dataset, make_actor_graph
+from pipelines.runtime.ray_tasks import MAX_RETRIES, flat_map_dataset, make_actor_graph, map_dataset
 from pipelines.runtime.resources import find_device
 from pipelines.schema.dataset import Dataset
+from pipelines.schema.run_guard import guard_options
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
-from pipelines.training.latents import load_lvae
+from pipelines.training.latents import digest_weights, load_lvae
 
 Chunk = tuple[Shard, list[int]]  # A shard and some of its rows.
 AP_VARIANTS = {
@@ -62,6 +64,7 @@ AP_VARIANTS = {
 VOXEL_PX = 256  # Paper, Tab. 1.
 VOXEL_RANGE_M = (VoxelGrid.bottom_m, VoxelGrid.top_m)
 PICTURE_PX = 480
+RECORDS_VERSION = 1  # Version of the records; files with another version are computed again.
 SCENE_SCORES = pa.schema(
     [("scene_id", pa.string()), ("primitives", pa.int64()), ("rebuilt_primitives", pa.int64())]
     + [
@@ -223,18 +226,26 @@ def make_scene_record(
 def score_chunk(
     row: dict,
     chunks: list[Chunk],
+    directory: str,
     spec: LayoutSpec,
     voxels: VoxelGrid,
     dataset: Dataset | None,
     deduplicate: bool,
     label_threshold: float,
-) -> list[dict]:
-    """Compute one record per scene from an output row of a Reconstructor."""
-    return [
-        {"id": row["id"], "row": number, "scene_id": scene.scene_id}
+) -> dict:
+    """Write one record per scene of an output row of a Reconstructor; return the number of scenes."""
+    rows = [
+        {"row": number, "scene_id": scene.scene_id}
         | make_scene_record(scene, layout, latent, spec, voxels, dataset, deduplicate, label_threshold).to_row()
         for number, scene, layout, latent in unstack_layouts(row, chunks)
     ]
+    storage.write_parquet(pa.Table.from_pylist(rows), make_records_path(directory, row["id"]))
+    return {"id": row["id"], "scenes": len(rows)}
+
+
+def make_records_path(directory: str, number: int) -> str:
+    """Return the path of the file with the records of a chunk."""
+    return storage.join_uri(directory, f"chunk-{number:05d}.parquet")
 
 
 def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
@@ -248,10 +259,13 @@ def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
     return out
 
 
-def reconstruct_chunks(chunks: list[Chunk], lvae: str, num_actors: int) -> ray.data.Dataset:
+def reconstruct_chunks(
+    chunks: list[Chunk], lvae: str, num_actors: int, numbers: Sequence[int] | None = None
+) -> ray.data.Dataset:
     """Build the graph that reconstructs chunks; tasks with READER_CPUS process its rows."""
     spare = {"CPU": READER_CPUS}
-    return make_actor_graph(range(len(chunks)), Reconstructor, (chunks, lvae), num_actors, READER_CPUS, spare=spare)
+    numbers = range(len(chunks)) if numbers is None else numbers
+    return make_actor_graph(numbers, Reconstructor, (chunks, lvae), num_actors, READER_CPUS, spare=spare)
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,23 +286,27 @@ class Reconstruction:
 def evaluate_reconstruction(
     selection: SceneSubset,
     lvae: str,
+    directory: str,
     num_actors: int = 1,
     batch_size: int = 8,
     voxel_range_m: tuple[float, float] = VOXEL_RANGE_M,
     dataset: Dataset | None = None,
-    on_scene: Callable[[], None] | None = None,
+    on_scenes: Callable[[int], None] | None = None,
     label_threshold: float = EXISTENCE_THRESHOLD,
 ) -> Reconstruction:
     """Compute the reconstruction scores of an LVAE from the latent means of selected scenes (paper, Sec. 4.1).
 
+    Tasks write the records of the scenes to files. To resume an interrupted evaluation, call this function again.
+
     Args:
         selection: Scenes.
         lvae: Directory of the layout VAE.
+        directory: Directory for the records. Files that belong to other scenes, weights or options are deleted.
         num_actors: Maximum number of actors; each actor holds a model.
         batch_size: Maximum number of scenes per forward pass.
         voxel_range_m: Bottom and top of the voxel grid (m, scene frame).
         dataset: Dataset with the thresholds of density labels. None: label fidelity is not scored.
-        on_scene: Called after each scene.
+        on_scenes: Called with the number of scenes of each finished chunk.
         label_threshold: Minimum existence probability of the primitives that determine density labels. Generated
             scenes are compared with these labels, so it should be the threshold of generation. All other scores use
             the paper's threshold.
@@ -299,33 +317,63 @@ def evaluate_reconstruction(
     model, chunks = load_lvae(lvae), split_chunks(selection, batch_size)
     spec, deduplicate = model.spec, model.proposes_duplicates
     voxels = make_voxel_grid(spec, voxel_range_m)
-    graph = flat_map_dataset(
-        reconstruct_chunks(chunks, lvae, num_actors),
-        score_chunk,
-        fn_kwargs={
-            "chunks": chunks,
-            "spec": spec,
-            "voxels": voxels,
-            "dataset": dataset,
-            "deduplicate": deduplicate,
-            "label_threshold": label_threshold,
+    options = {"deduplicate": deduplicate, "label_threshold": label_threshold}
+    guard_options(
+        storage.join_uri(directory, "records.json"),
+        options
+        | {
+            "version": RECORDS_VERSION,
+            "selection": asdict(selection),
+            "files": selection.files(),
+            "weights": digest_weights(model),
+            "batch_size": batch_size,
+            "voxel_range_m": list(voxel_range_m),
+            "labels": dataset and [asdict(dataset.vegetation), asdict(dataset.vehicle)],
         },
-        num_cpus=READER_CPUS,
+        is_in_use=lambda: False,
+        discard=lambda: storage.delete_directory(directory),
+        describe=str,
     )
-    rows = []
-    for row in graph.iter_rows():
-        rows.append(row)
-        if on_scene:
-            on_scene()
-    rows.sort(key=lambda row: (row["id"], row["row"]))
-    records = [SceneRecord.from_row(row) for row in rows]
-    scores = compute_reconstruction_scores(records, spec, voxels)
+    promised = {make_records_path(directory, number): len(rows) for number, (_, rows) in enumerate(chunks)}
+    faulty = storage.find_faulty_files(promised)
+    missing = [number for number, path in enumerate(promised) if path in faulty]
+    if on_scenes:
+        on_scenes(sum(promised.values()) - sum(promised[path] for path in faulty))
+    if missing:
+        arguments = {"chunks": chunks, "directory": directory, "spec": spec, "voxels": voxels, "dataset": dataset}
+        graph = map_dataset(
+            reconstruct_chunks(chunks, lvae, num_actors, missing),
+            score_chunk,
+            fn_kwargs=arguments | options,
+            num_cpus=READER_CPUS,
+        )
+        for row in graph.iter_rows():
+            if on_scenes:
+                on_scenes(row["scenes"])
+    storage.require_rows(promised)
+    scores, table, places = ray.get(merge_records.remote(list(promised), spec, voxels))
     scores["memory_bytes"]["tables"] = measure_table_bytes(chunks)
     scores["label_existence_threshold"] = label_threshold
+    return Reconstruction(scores, table, [(chunks[number][0], [row]) for number, row in places])
+
+
+@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
+def merge_records(
+    paths: list[str], spec: LayoutSpec, voxels: VoxelGrid
+) -> tuple[dict, pa.Table, list[tuple[int, int]]]:
+    """Compute the scores from all records. The records of many scenes are too large for the driver.
+
+    Returns:
+        Scores, one row of scores per scene, and the chunk and row of each scene. The scenes are in order of decreasing
+        voxel mIoU.
+    """
+    rows = [row | {"id": number} for number, path in enumerate(paths) for row in storage.read_parquet(path).to_pylist()]
+    records = [SceneRecord.from_row(row) for row in rows]
     table = compute_scene_scores([row["scene_id"] for row in rows], records)
     # Empty scenes have NaN and are sorted to the end.
     order = np.argsort(-table["voxel_miou"].to_numpy(), kind="stable")
-    return Reconstruction(scores, table.take(order), [(chunks[rows[k]["id"]][0], [int(rows[k]["row"])]) for k in order])
+    places = [(rows[k]["id"], int(rows[k]["row"])) for k in order]
+    return compute_reconstruction_scores(records, spec, voxels), table.take(order), places
 
 
 def draw_scenes(

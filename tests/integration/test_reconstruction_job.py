@@ -19,20 +19,31 @@ def select_scenes(root: Path) -> SceneSubset:
 
 
 @pytest.fixture(scope="module")
-def reconstruction(reconstruction_dataset, cluster) -> Reconstruction:
-    return evaluate_reconstruction(select_scenes(reconstruction_dataset), str(reconstruction_dataset / "lvae"))
+def reconstruction(reconstruction_dataset, cluster, tmp_path_factory) -> Reconstruction:
+    lvae, records = str(reconstruction_dataset / "lvae"), str(tmp_path_factory.mktemp("records"))
+    return evaluate_reconstruction(select_scenes(reconstruction_dataset), lvae, records)
 
 
-def test_reconstruction_is_independent_of_chunks_and_workers(reconstruction_dataset, reconstruction):
-    done = []
-    again = evaluate_reconstruction(
-        select_scenes(reconstruction_dataset),
-        str(reconstruction_dataset / "lvae"),
-        2,
-        batch_size=3,
-        on_scene=lambda: done.append(1),
-    )
-    assert len(done) == reconstruction.scores["scenes"] == len(reconstruction.scenes) == 11
+def test_reconstruction_is_independent_of_chunks_and_workers(reconstruction_dataset, reconstruction, tmp_path):
+    done: list[int] = []
+
+    def evaluate() -> Reconstruction:
+        done.clear()
+        where = str(reconstruction_dataset / "lvae"), str(tmp_path / "records")
+        return evaluate_reconstruction(
+            select_scenes(reconstruction_dataset), *where, 2, batch_size=3, on_scenes=done.append
+        )
+
+    again = evaluate()
+    assert done[0] == 0 and sum(done) == reconstruction.scores["scenes"] == len(reconstruction.scenes) == 11
+    files = sorted((tmp_path / "records").glob("*.parquet"))
+    kept = {path: path.stat().st_mtime_ns for path in files}
+    files[0].unlink()
+    files[1].write_bytes(b"damaged")
+    resumed = evaluate()
+    assert done[0] == 5 and sum(done) == 11  # two of five chunks, each of 3 scenes, are computed again
+    assert all(path.stat().st_mtime_ns == kept[path] for path in files[2:])
+    assert repr(resumed.scores) == repr(again.scores) and resumed.scenes == again.scenes
     first, second = flatten_scores(reconstruction.scores), flatten_scores(again.scores)
     different = [name for name in first if first[name] != pytest.approx(second[name], rel=1e-3, abs=1e-6)]
     assert first.keys() == second.keys() and not different

@@ -55,7 +55,7 @@ def test_conflicting_option_is_an_error_that_names_both(options, message):
         apply_protocol(Config(**options))
 
 
-def test_blank_pictures_are_found_and_dropped():
+def test_blank_pictures_are_found_and_dropped(tmp_path):
     pictures = np.full((5, 4, 4, 3), 255, np.uint8)
     pictures[1, 0, 0] = 254  # nearly white
     pictures[2, 3, 3] = 0  # one black pixel
@@ -63,8 +63,15 @@ def test_blank_pictures_are_found_and_dropped():
     pictures[4] = 90
     found = find_blank_pictures(pictures)
     assert found.tolist() == [True, False, True, False, False]
-    kept, dropped = drop_blank({"blank": found[:, None].astype(np.uint8), "random": np.arange(5.0)[:, None]})
+    columns = {"blank": found[:, None].astype(np.uint8), "random": np.arange(5.0)[:, None]}
+    for number, rows in enumerate((slice(0, 2), slice(2, 5))):
+        names = [f"scene-{k}" for k in range(5)[rows]]
+        write_part(str(tmp_path), number, names, names, {name: values[rows] for name, values in columns.items()})
+    whole = FeatureParts(str(tmp_path), 2).open()
+    assert set(whole) == {"scene_id", "place", "blank", "random"} and "row" not in whole
+    kept, dropped = drop_blank(whole)
     assert dropped == 2 and kept["row"].tolist() == [1, 3, 4] and kept["random"].ravel().tolist() == [1, 3, 4]
+    assert kept["scene_id"].tolist() == ["scene-1", "scene-3", "scene-4"]
 
 
 def write_parts(directory: str, features: np.ndarray, sizes: tuple[int, ...], column: str = "random") -> FeatureParts:
