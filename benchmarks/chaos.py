@@ -84,6 +84,8 @@ class Config:
     """Stages to disturb, in turn."""
     raylets: int = 3
     """Number of nodes, each with one CPU."""
+    victims: tuple[Literal["worker", "raylet", "driver"], ...] = ()
+    """Victims, in turn (default: a random victim)."""
     seed: int = 0
     """Seed of the moments and victims."""
     first: int = 0
@@ -219,12 +221,8 @@ def disturb(store: Store, stage: str, run: str, victim: str, rng: random.Random)
         failures.append("timeout" if code is None else f"exit code {code}")
         attempts += 1
         code = wait(store.start(stage, run, log), STAGE_TIMEOUT_S)
-    found, expected = store.digest(run), store.expected[stage]
     faults = [f"exit code {code}"] if code else []
-    faults += [f"lost {name}" for name in expected if name not in found]
-    faults += [f"added {name}" for name in found if name not in expected]
-    both = sorted(set(found) & set(expected))
-    faults += [f"{name}: {found[name]}, not {expected[name]}" for name in both if found[name] != expected[name]]
+    faults += find_faults(store.digest(run), store.expected[stage])
     needless = [] if victim == "driver" or not failures else [f"{victim} killed: {', '.join(failures)}"]
     return {
         "run": run,
@@ -237,6 +235,14 @@ def disturb(store: Store, stage: str, run: str, victim: str, rng: random.Random)
         "faults": faults,
         "log": log.read_text()[-4000:] if faults or needless else "",
     }
+
+
+def find_faults(found: dict[str, str], expected: dict[str, str]) -> list[str]:
+    """Return the differences between the digests of a run and of the undisturbed run."""
+    faults = [f"lost {name}" for name in expected if name not in found]
+    faults += [f"added {name}" for name in found if name not in expected]
+    both = sorted(set(found) & set(expected))
+    return faults + [f"{name}: {found[name]}, not {expected[name]}" for name in both if found[name] != expected[name]]
 
 
 def restore_raylets(cluster: Cluster) -> None:
@@ -295,14 +301,16 @@ def main(config: Config) -> int:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="chaos-")))
         stores: dict[str, Store] = {}
         for k in itertools.count(config.first):
-            if sum(counts[victim] for victim in VICTIMS) == config.kills:
+            if sum(counts[victim] for victim in VICTIMS) >= config.kills:
                 break
             rng = random.Random(f"{config.seed} {k}")
             kind, stage = config.stores[k % len(config.stores)], config.stages[k % len(config.stages)]
             if kind not in stores:
                 stores[kind] = stack.enter_context(open_store(kind, folder / kind, config.raylets))
             stores[kind].run_undisturbed(stage)
-            record = disturb(stores[kind], stage, f"run-{k}", rng.choice(VICTIMS), rng)
+            killed = sum(counts[name] for name in VICTIMS)
+            victim = config.victims[killed % len(config.victims)] if config.victims else rng.choice(VICTIMS)
+            record = disturb(stores[kind], stage, f"run-{k}", victim, rng)
             counts[record["killed"].split()[0].rstrip(":")] += 1
             counts["different"] += bool(record["faults"])
             counts["repeated"] += bool(record["repeated"])

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
 import time
 from pathlib import Path
+from typing import Any
 
+import ray
 from PIL import Image
 
 from jobs.support.cli import home_path, require_tracking_uri
 from models.uris import parse_s3_options, split_options
 from pipelines.runtime import provenance, storage
+from pipelines.runtime.machines import find_start_time, identify_machine, is_process_alive
+
+OWNER = "owner"  # Tag with the driver of a run.
 
 
 def find_tracking_uri() -> str:
@@ -53,6 +59,47 @@ def make_client(uri: str):
     return MlflowClient(tracking_uri=uri)
 
 
+def describe_owner() -> dict[str, Any]:
+    """Describe this driver: its process, and its job in a Ray cluster."""
+    owner: dict[str, Any] = {
+        "machine": identify_machine(),
+        "process": os.getpid(),
+        "start_time": find_start_time(os.getpid()),
+    }
+    if ray.is_initialized():
+        context = ray.get_runtime_context()
+        owner |= {"session": context.get_session_name(), "ray_job": context.get_job_id()}
+    return owner
+
+
+def is_owner_dead(owner: dict[str, Any]) -> bool:
+    """Return whether the driver of a run has certainly ended; a driver of an unknown cluster may live."""
+    if owner.get("machine") == identify_machine():
+        return not is_process_alive(int(owner["process"]), str(owner["start_time"]))
+    if not ray.is_initialized() or owner.get("session") != ray.get_runtime_context().get_session_name():
+        return False
+    from ray._private.state import state
+
+    jobs = {job["JobID"]: job["IsDead"] for job in state.job_table()}
+    return bool(jobs.get(owner.get("ray_job"), True))
+
+
+def close_dead_runs(api: Any, experiment_id: str) -> None:
+    """Set the status of runs to KILLED whose drivers ended without setting it.
+
+    Args:
+        api: MLflow client.
+        experiment_id: Experiment.
+    """
+    for run in api.search_runs([experiment_id], "attributes.status = 'RUNNING'"):
+        try:
+            is_dead = is_owner_dead(json.loads(run.data.tags[OWNER]))
+        except (KeyError, ValueError, TypeError):  # Runs of earlier versions do not name their owner.
+            continue
+        if is_dead:
+            api.set_terminated(run.info.run_id, "KILLED")
+
+
 class Tracker:
     """Write to one MLflow run. A tracker can be pickled, because each process opens its own client."""
 
@@ -86,13 +133,15 @@ class Tracker:
             The tracker.
         """
         uri = find_tracking_uri()
-        if record and storage.exists(record) and (known := storage.read_json(record))["tracking_uri"] == uri:
-            make_client(uri).update_run(known["run_id"], status="RUNNING")
-            return cls(uri, known["run_id"])
         if uri.startswith("sqlite:///"):
             Path(uri.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
         api = make_client(uri)
-        found = api.get_experiment_by_name(experiment)
+        if (found := api.get_experiment_by_name(experiment)) is not None:
+            close_dead_runs(api, found.experiment_id)
+        if record and storage.exists(record) and (known := storage.read_json(record))["tracking_uri"] == uri:
+            api.update_run(known["run_id"], status="RUNNING")
+            api.set_tag(known["run_id"], OWNER, json.dumps(describe_owner()))
+            return cls(uri, known["run_id"])
         if found is None:
             artifacts = make_artifact_location() if uri.startswith("sqlite:") else None
             experiment_id = api.create_experiment(experiment, artifact_location=artifacts)
@@ -106,6 +155,7 @@ class Tracker:
             "commit": provenance.find_commit(),
             "machine": provenance.describe_machine(),
             "versions": provenance.list_versions(),
+            OWNER: json.dumps(describe_owner()),
         }
         for key, value in tags.items():
             api.set_tag(run_id, key, value)
