@@ -45,7 +45,7 @@ class Config:
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
     min_workers: int = 0
-    """Number of workers with which training goes on if nodes are lost; it grows again to --num-workers when nodes
+    """Number of workers with which training continues if nodes are lost; it grows again to --num-workers when nodes
     return (default: --num-workers)."""
     gpus: GpusOption = None
     wait_for_resources_s: WaitForResourcesOption = 0.0

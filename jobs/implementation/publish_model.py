@@ -12,7 +12,8 @@ import torch
 
 from jobs.publish_model import Config
 from jobs.support.cli import home_path, resolve_path
-from jobs.support.model_directories import find_pipeline_directory, publish_directory
+from jobs.support.model_directories import find_pipeline_directory
+from jobs.support.model_files import publish_directory
 from jobs.support.outputs import hold_lease
 from jobs.support.registry import EXPERIMENT, PIPELINE, register_version
 from jobs.support.tracking import Tracker, find_tracking_uri, hide_credentials, make_client

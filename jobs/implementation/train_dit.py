@@ -25,7 +25,8 @@ from jobs.implementation.train_lvae import train as train_lvae
 from jobs.support import trainer
 from jobs.support.callbacks import SamplingCheck
 from jobs.support.cli import home_path, make_absolute, resolve_path
-from jobs.support.model_directories import find_pipeline_directory, publish_directory
+from jobs.support.model_directories import find_pipeline_directory
+from jobs.support.model_files import publish_directory
 from jobs.support.outputs import hold_training
 from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun

@@ -17,7 +17,8 @@ from jobs.implementation.smoke_inputs import make_smoke_dataset
 from jobs.support import trainer
 from jobs.support.callbacks import ReconstructionCheck
 from jobs.support.cli import home_path, resolve_path
-from jobs.support.model_directories import find_pipeline_directory, publish_directory
+from jobs.support.model_directories import find_pipeline_directory
+from jobs.support.model_files import publish_directory
 from jobs.support.outputs import hold_training
 from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun, convert_to_tensors

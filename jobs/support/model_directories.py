@@ -1,10 +1,8 @@
-"""Find the pipeline that --model names, and write models. Importing this module imports neither torch nor MLflow."""
+"""Find the pipeline that --model names. Importing this module imports neither torch nor MLflow."""
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 from collections.abc import Iterable
 
 from jobs.support.cli import home_path, make_absolute
@@ -71,29 +69,3 @@ def find_pipeline_directory(model: str) -> str:
 
         return download_pipeline(model)
     return find_pipeline_path(model)
-
-
-def publish_directory(directory: str, output: str) -> None:
-    """Copy a saved model or pipeline file by file. The last files are those that mark a copy as complete.
-
-    Args:
-        directory: Local directory.
-        output: Target directory or URI.
-
-    Raises:
-        ValueError: A file is not in the output, or has another size there.
-    """
-    paths = [
-        os.path.relpath(os.path.join(top, name), directory) for top, _, names in os.walk(directory) for name in names
-    ]
-    for path in sorted(paths, key=lambda path: (path == "model_index.json", path.endswith("config.json"), path)):
-        with open(os.path.join(directory, path), "rb") as source:
-            storage.write_whole(
-                storage.join_uri(output, path), lambda stream, source=source: shutil.copyfileobj(source, stream)
-            )
-    faults = {}
-    for path in paths:
-        target, expected = storage.join_uri(output, path), os.path.getsize(os.path.join(directory, path))
-        if storage.measure_file_bytes(target) != expected:
-            faults[target] = f"{target}: not the file of {expected:,} bytes that was written"
-    storage.raise_faults(faults, len(paths))

@@ -9,7 +9,7 @@ from pathlib import Path
 from mlflow.exceptions import MlflowException
 
 from jobs.support.cli import home_path
-from jobs.support.model_directories import publish_directory
+from jobs.support.model_files import publish_directory
 from jobs.support.tracking import find_tracking_uri, hide_credentials, make_client
 from models.base import MAX_CONFIG_BYTES
 from models.options import show_value

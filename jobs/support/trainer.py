@@ -25,7 +25,7 @@ from ray.train.v2.api.exceptions import WorkerGroupError
 
 from jobs.support.cli import find_root_cause
 from jobs.support.log import print_event
-from jobs.support.model_directories import publish_directory
+from jobs.support.model_files import publish_directory
 from jobs.support.progress import JobProgress
 from jobs.support.ray_session import run_packed, start_ray
 from jobs.support.tracking import Tracker
@@ -209,7 +209,7 @@ def fit(run: TrainingRun, num_workers: int, output: str, min_workers: int = 0) -
     Args:
         run: Training run.
         num_workers: Maximum number of Ray Train workers.
-        min_workers: Number of workers with which the training goes on if nodes are lost. 0: `num_workers`.
+        min_workers: Number of workers with which the training continues if nodes are lost. 0: `num_workers`.
         output: Directory or URI for the model. The model has the EMA weights if EMA is enabled.
 
     Returns:
@@ -243,7 +243,7 @@ def fit(run: TrainingRun, num_workers: int, output: str, min_workers: int = 0) -
 
 
 def fit_with_retries(run: TrainingRun, scaling: ScalingConfig) -> ray.train.Result:
-    """Run Ray Train; after RETRIES failures, go on if there is a new checkpoint since the first of them.
+    """Run Ray Train; after RETRIES failures, continue if there is a new checkpoint since the first of them.
 
     Args:
         run: Training run.
@@ -275,7 +275,7 @@ def fit_with_retries(run: TrainingRun, scaling: ScalingConfig) -> ray.train.Resu
             if is_bug or find_last_checkpoint(run) == before:
                 raise
             print_event(
-                f"{run.name}: workers failed {RETRIES + 1} times, but there is a new checkpoint; training goes on",
+                f"{run.name}: workers failed {RETRIES + 1} times, but there is a new checkpoint; training continues",
                 {"event": "retry"},
             )
 

@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import ray
-import torch
 from ray.exceptions import GetTimeoutError
 from ray.util import placement_group, remove_placement_group
 
@@ -89,6 +88,8 @@ def find_device() -> str:
     Raises:
         ValueError: Ray assigned a GPU, but torch cannot use it. The model would be slow on the CPU without a message.
     """
+    import torch  # the nodes that preprocess drives need no torch
+
     if ray.is_initialized() and ray.get_runtime_context().worker.mode == ray.WORKER_MODE:
         if not (assigned := ray.get_runtime_context().get_accelerator_ids().get("GPU")):
             return "cpu"

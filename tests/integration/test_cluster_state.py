@@ -12,6 +12,7 @@ import pytest
 import ray
 from helpers import ROOT
 
+from jobs.support.cli import find_root_cause
 from jobs.support.progress import METRICS, JobProgress
 from pipelines.runtime.cluster_state import count_retries, list_running_tasks, list_waiting
 from pipelines.runtime.ray_tasks import map_actors
@@ -68,8 +69,10 @@ def test_error_of_an_actors_constructor_keeps_its_type(cluster):
         def __call__(self, row: dict) -> dict:
             return row
 
-    with pytest.raises(ValueError, match=r"model.bin: damaged; copy it again"):
+    with pytest.raises(Exception, match=r"model\.bin") as caught:
         list(map_actors(range(2), Broken, (), num_actors=1))
+    cause = find_root_cause(caught.value)
+    assert isinstance(cause, ValueError) and str(cause).startswith("model.bin: damaged; copy it again")
 
 
 def test_prometheus_reads_the_metrics_of_the_dashboard(cluster):

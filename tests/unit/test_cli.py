@@ -85,7 +85,13 @@ def test_option_modules_import_nothing_heavy():
     assert done.returncode == 0 and not heavy & set(done.stdout.split()), done.stderr
 
 
-SHARED = ("ModelOption", "IfBusyOption")  # Their help is in jobs/support/options.py.
+SHARED = (
+    "ModelOption",
+    "IfBusyOption",
+    "GpusOption",
+    "WaitForResourcesOption",
+    "LogFormatOption",
+)  # Their help is in jobs/support/options.py.
 
 
 @pytest.mark.parametrize("job", JOBS)
