@@ -244,6 +244,7 @@ def test_generated_and_edited_scenes_in_s3_equal_local(s3, cache, tmp_path):
     assert not list(Path.cwd().glob("s3:*"))
 
 
+@pytest.mark.slow  # tests/faults/test_cluster_storage.py evaluates scenes in object storage.
 def test_evaluation_of_scenes_in_s3_equals_local(s3, cache, tmp_path, monkeypatch):
     from jobs.evaluate_scenes import Config
     from jobs.implementation.evaluate_scenes import evaluate
