@@ -9,7 +9,8 @@
 #   make coverage    make test with line coverage, without lines in Ray's processes; half as long again
 PYTHON ?= python3
 BIN := .venv/bin
-PYTEST := $(BIN)/python -m pytest -q -n 2
+# Three processes on two cores: tests of clusters wait half of the time.
+PYTEST := $(BIN)/python -m pytest -q -n 3
 
 # Quiet and quick Ray on small machines; no telemetry.
 export RAY_AUTH_MODE ?= disabled

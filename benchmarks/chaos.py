@@ -253,7 +253,7 @@ def restore_raylets(cluster: Cluster) -> None:
 
 
 @contextmanager
-def open_store(kind: str, folder: Path, num_raylets: int, **options: Any) -> Iterator[Store]:
+def open_store(kind: str, folder: Path, num_raylets: int, has_mlflow: bool = True, **options: Any) -> Iterator[Store]:
     """Start the servers and the cluster for a store; stop them when the body ends."""
     folder.mkdir()
     disk = folder / "disk"
@@ -280,13 +280,15 @@ def open_store(kind: str, folder: Path, num_raylets: int, **options: Any) -> Ite
             home = f"s3://tests/home?endpoint_override={url}&region=us-east-1"
             environment |= {"MLFLOW_S3_ENDPOINT_URL": url, "AWS_DEFAULT_REGION": "us-east-1"}
         artifacts = "s3://tests/mlartifacts" if kind == "s3" else str(folder / "mlartifacts")
-        environment["MLFLOW_TRACKING_URI"] = stack.enter_context(run_mlflow(folder, artifacts, environment))
+        tracking = stack.enter_context(run_mlflow(folder, artifacts, environment)) if has_mlflow else ""
+        environment["MLFLOW_TRACKING_URI"] = tracking
         os.environ |= KEYS
         private = disk if kind == "s3" else None
         cluster = stack.enter_context(run_cluster(Cluster(folder, private, environment), num_raylets, **options))
         if kind == "s3":
             create_bucket(url)
-        wait_for_server(f"{environment['MLFLOW_TRACKING_URI']}/health")
+        if tracking:
+            wait_for_server(f"{tracking}/health")
         yield Store(kind, home, cluster)
 
 
@@ -300,13 +302,14 @@ def main(config: Config) -> int:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="chaos-")))
         stores: dict[str, Store] = {}
+        has_mlflow = set(config.stages) != {"preprocess"}  # All other stages need a trained model.
         for k in itertools.count(config.first):
             if sum(counts[victim] for victim in VICTIMS) >= config.kills:
                 break
             rng = random.Random(f"{config.seed} {k}")
             kind, stage = config.stores[k % len(config.stores)], config.stages[k % len(config.stages)]
             if kind not in stores:
-                stores[kind] = stack.enter_context(open_store(kind, folder / kind, config.raylets))
+                stores[kind] = stack.enter_context(open_store(kind, folder / kind, config.raylets, has_mlflow))
             stores[kind].run_undisturbed(stage)
             killed = sum(counts[name] for name in VICTIMS)
             victim = config.victims[killed % len(config.victims)] if config.victims else rng.choice(VICTIMS)

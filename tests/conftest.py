@@ -69,7 +69,17 @@ SMOKE_MODULES = {
     "test_publish_job",
     "test_voxel_import_job",
 }
-SLOW_MODULES = ("test_faults", "test_train_jobs", "test_commands", "test_ablation_job", "test_preprocess_job")
+SLOW_MODULES = (
+    "test_cluster_storage",
+    "test_elastic",
+    "test_concurrent_jobs",
+    "test_chaos",
+    "test_faults",
+    "test_train_jobs",
+    "test_commands",
+    "test_ablation_job",
+    "test_preprocess_job",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

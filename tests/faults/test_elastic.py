@@ -73,7 +73,7 @@ def test_stopped_training_is_killed_in_mlflow_and_resumes(tmp_path):
     environment = make_environment(tmp_path)
 
     def start() -> subprocess.Popen:
-        words = [*TRAIN, "--steps", "1000", "--checkpoint-every", "20"]
+        words = [*TRAIN, "--steps", "200", "--checkpoint-every", "20"]
         return subprocess.Popen(
             words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1
         )
@@ -88,8 +88,8 @@ def test_stopped_training_is_killed_in_mlflow_and_resumes(tmp_path):
 
     first = start()
     try:
-        wait_for(first, r"step 40/1000")
-        second = subprocess.run([*TRAIN, "--steps", "1000"], env=environment, capture_output=True, text=True)
+        wait_for(first, r"step 24/200")
+        second = subprocess.run([*TRAIN, "--steps", "200"], env=environment, capture_output=True, text=True)
         assert second.returncode == 2 and "writes 'lvae-smoke' here" in second.stderr  # never two trainings of a run
         first.send_signal(signal.SIGTERM)
         rest = first.communicate(timeout=60)[0]
@@ -105,8 +105,8 @@ def test_stopped_training_is_killed_in_mlflow_and_resumes(tmp_path):
     assert read_run().info.status == "KILLED"
     again = start()
     try:
-        line = wait_for(again, r"step \d+/1000")
-        assert int(re.search(r"step (\d+)/", line)[1]) > 40
+        line = wait_for(again, r"step \d+/200")
+        assert int(re.search(r"step (\d+)/", line)[1]) > 20
         assert read_run().info.status == "RUNNING"
         again.send_signal(signal.SIGKILL)
     finally:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import ray
+import ray.data
 from helpers import ROOT
 
 from jobs.support.cli import find_root_cause
@@ -61,7 +61,10 @@ def test_more_actors_than_the_cluster_has_room_for_do_not_hang(cluster):
     assert sorted(row["twice"] for row in rows) == list(range(0, 40, 2))
 
 
-def test_error_of_an_actors_constructor_keeps_its_type(cluster):
+def test_error_of_an_actors_constructor_keeps_its_type(cluster, monkeypatch):
+    context = ray.data.DataContext.get_current()
+    monkeypatch.setattr(context, "raise_original_map_exception", True)  # as start_ray does
+
     class Broken:
         def __init__(self) -> None:
             raise ValueError("model.bin: damaged; copy it again")
