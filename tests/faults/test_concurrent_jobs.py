@@ -41,7 +41,7 @@ def list_tables(output: Path) -> list[Path]:
     return sorted(path for path in output.rglob("*.parquet") if "/." not in str(path.relative_to(output)))
 
 
-@pytest.mark.parametrize("job", JOBS)
+@pytest.mark.parametrize("job", ["preprocess", pytest.param("sample", marks=pytest.mark.slow)])
 def test_one_of_two_jobs_writes_and_the_other_follows_or_takes_over(tmp_path, job):
     output = tmp_path / "made"
     processes = [start(job, output)]
