@@ -63,7 +63,8 @@ def test_chain_on_s3_survives_loss_of_a_node(folder, cluster, tmp_path, monkeypa
 
     with record_connections() as (proxy, connections), chaos.open_store("s3", folder / "s3", 2) as store:
         outside = {name: proxy for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY")}
-        near = {name: f"127.0.0.1,localhost,{ray.util.get_node_ip_address()}" for name in ("no_proxy", "NO_PROXY")}
+        hosts = f"localhost,127.0.0.1,127.0.0.2,{ray.util.get_node_ip_address()}"  # 127.0.0.2 is the second raylet.
+        near = {name: hosts for name in ("no_proxy", "NO_PROXY")}
         environment = store.cluster.environment | outside | near | {"PRITTI_HOME": store.home}
         words = json.dumps([store.list_words(stage, stage)[1:] for stage in chaos.STAGES])
         with (folder / "out").open("w") as log:
