@@ -9,6 +9,7 @@ are structures in Thrift's compact protocol (github.com/apache/parquet-format).
 from __future__ import annotations
 
 import struct
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,28 +119,37 @@ def _parse_entry(data: bytes, at: int, kind: int, depth: int) -> tuple[Any, int]
     return _parse_value(data, at, kind, depth)
 
 
-def measure_columns(file: Any) -> tuple[int, list[ColumnSize]]:
+def measure_columns(file: Any, columns: Collection[str] | None = None) -> tuple[int, list[ColumnSize]]:
     """Measure the columns of a Parquet file. No page is decompressed.
 
     Args:
-        file: Open binary file with `seek`, `tell` and `read`.
+        file: Open binary file with `seek`, `tell` and `read`. If it has the method `prefetch` (`RemoteFile`), the
+            measured columns are read into memory.
+        columns: Names of the columns to measure (default: all columns).
 
     Returns:
-        Number of rows that the metadata state, and the size of each leaf column.
+        Number of rows that the metadata state, and the size of each leaf column that is measured.
 
     Raises:
         ValueError: The file is no Parquet file, is encrypted, or its metadata or page headers are damaged.
     """
     try:
-        return _measure(file)
+        return _measure(file, columns)
     except (IndexError, KeyError, TypeError, AttributeError, struct.error) as error:
         raise ValueError("the metadata or a page header is damaged") from error
 
 
-def _measure(file: Any) -> tuple[int, list[ColumnSize]]:
+def _measure(file: Any, columns: Collection[str] | None) -> tuple[int, list[ColumnSize]]:
     footer, end = _read_footer(file)
     leaves = [element for element in footer[2] if not element.get(5)]
     sizes: dict[int, list] = {}
+
+    def is_wanted(column: Struct) -> bool:
+        return columns is None or column[3][0].decode("utf-8") in columns
+
+    if hasattr(file, "prefetch"):
+        chunks = [chunk[3] for group in footer.get(4, []) for chunk in group[1]]
+        file.prefetch([_find_chunk(column) for column in chunks if is_wanted(column)])
     for group in footer.get(4, []):
         if len(group[1]) != len(leaves):
             raise ValueError(f"a row group has {len(group[1])} columns, but the schema has {len(leaves)}")
@@ -149,13 +159,14 @@ def _measure(file: Any) -> tuple[int, list[ColumnSize]]:
             column = chunk[3]
             if not _is_known(column):
                 raise ValueError("a column names an encoding or a type of page that the format does not have")
-            values, size, has_dictionary = _measure_pages(file, column, end)
+            values, size, has_dictionary = _measure_pages(file, column, end) if is_wanted(column) else (0, 0, False)
             path = tuple(name.decode("utf-8") for name in column[3])
             known = sizes.setdefault(k, [path, 0, 0, False])
             if known[0] != path or path[-1:] != (leaves[k][4].decode("utf-8"),):
                 raise ValueError(f"the path of column {k} differs from the schema")
             sizes[k] = [path, known[1] + values, known[2] + size, known[3] or has_dictionary]
-    return _require_count(footer[3]), [ColumnSize(*entry) for entry in sizes.values()]
+    found = [ColumnSize(*entry) for entry in sizes.values()]
+    return _require_count(footer[3]), [size for size in found if columns is None or size.path[0] in columns]
 
 
 def _is_known(column: Struct) -> bool:
@@ -187,16 +198,20 @@ def _read_footer(file: Any) -> tuple[Struct, int]:
     return _parse_struct(bytes(file.read(size)), 0)[0], total - 8 - size
 
 
+def _find_chunk(column: Struct) -> tuple[int, int]:
+    """Return the positions of the first byte of a column chunk and of the byte after it; (0, 0) for an empty one."""
+    starts = [_require_count(column[key]) for key in (9, 11) if column.get(key)]
+    return (min(starts), min(starts) + _require_count(column[7])) if starts else (0, 0)
+
+
 def _measure_pages(file: Any, column: Struct, end: int) -> tuple[int, int, bool]:
     """Return the number of values and the decompressed bytes of a column chunk, and whether it has a dictionary."""
-    wanted, stored = _require_count(column[5]), _require_count(column[7])
-    starts = [_require_count(column[key]) for key in (9, 11) if column.get(key)]
-    if not starts and not wanted:
+    wanted = _require_count(column[5])
+    place, last = _find_chunk(column)
+    if not place and not wanted:
         return 0, 0, False  # A table without rows.
-    if not starts:
+    if not place:
         raise ValueError("a column has values but states no position")
-    place = min(starts)
-    last = place + stored
     if place < 4 or last > end:
         raise ValueError("a column lies outside the file")
     seen = values = size = 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Collection
 from typing import Any
 
 import ray
@@ -15,19 +16,24 @@ MARKER = ".node-"  # Begin of the names of markers.
 NODE_TIMEOUT_S = 120.0  # Longest time that a node may take to write its marker; a new worker process imports packages.
 
 
-def require_shared_storage(output: str) -> None:
+def require_shared_storage(output: str, checked: Collection[str] = ()) -> set[str]:
     """Check that each node writes files that the driver can read, and that all nodes run the same code.
 
     Each node writes a marker to the output. The driver reads the markers and deletes them.
 
     Args:
         output: Directory or URI to which tasks will write.
+        checked: Ids of nodes that need no check.
+
+    Returns:
+        Ids of all nodes of the cluster, which have passed the check.
 
     Raises:
         ValueError: A node writes elsewhere, cannot write, does not answer or runs another version of the package. The
             message names the node and the remedy.
     """
-    nodes = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}
+    alive = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}
+    nodes = {name: node for name, node in alive.items() if name not in checked}
     token = secrets.token_hex(8)
     markers = {node: storage.join_uri(output, f"{MARKER}{token}-{node}") for node in nodes}
     write = ray.remote(num_cpus=0, max_retries=3)(write_marker)
@@ -42,6 +48,7 @@ def require_shared_storage(output: str) -> None:
         # The tasks are not cancelled: if a task ends in the same moment, `ray.cancel` ends the driver (Ray 2.60).
         for marker in markers.values():
             storage.delete_file(marker)
+    return set(alive)
 
 
 def _find_node_name(node: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ import json
 import os
 import secrets
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any, TypeVar
@@ -26,6 +26,7 @@ from models.strict_json import parse_json
 from models.uris import OBJECT_STORES, connect_fsspec, join_uri, resolve_uri, split_name
 from pipelines.runtime.machines import identify_machine, is_process_alive
 from pipelines.runtime.parquet_sizes import ITEM_BYTES, measure_columns
+from pipelines.runtime.remote_file import RemoteFile
 
 T = TypeVar("T")
 pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
@@ -256,7 +257,8 @@ def read_parquet(
         raise ValueError(f"{uri}: cannot be opened ({error}); check the path, permissions and connection") from error
     try:
         with opened as stream:
-            table = _read_checked(stream, columns, schema, encoded)
+            source = stream if isinstance(fs, pafs.LocalFileSystem) else RemoteFile(stream)
+            table = _read_checked(source, columns, schema, encoded)
     except (LimitError, SchemaError) as error:
         raise ValueError(f"{uri}: {error}") from error
     except Exception as error:  # A damaged file makes pyarrow raise errors of many types.
@@ -299,14 +301,12 @@ def _check_sizes(stream: Any, schema: pa.Schema, columns: Sequence[str]) -> tupl
     A dictionary stores each text once, so few bytes can state many long texts. A column whose texts could exceed
     TEXT_BYTES is decoded only after their total length is known (`_decode_texts`).
     """
-    num_rows, sizes = measure_columns(stream)
+    num_rows, sizes = measure_columns(stream, columns)
     require_within("table_rows", num_rows)
     kinds = {name: schema.field(name).type for name in columns}
     total, texts = 0, dict.fromkeys((name for name, kind in kinds.items() if _is_text(kind)), 0)
     for column in sizes:
-        name = column.path[0]
-        if (kind := kinds.get(name)) is None:
-            continue
+        name, kind = column.path[0], kinds[column.path[0]]
         # A text in a list can be repeated, so the bound of such a column is coarse.
         is_repeated = len(column.path) > 1 and _holds_texts(kind)
         total += column.bytes + column.values * (column.bytes if is_repeated else ITEM_BYTES)
@@ -436,6 +436,20 @@ def require_rows(promised: Mapping[str, int]) -> None:
         ValueError: A file is missing, is damaged or has another number of rows. The message names the file.
     """
     raise_faults(find_faulty_files(promised), len(promised))
+
+
+def require_files(promised: Collection[str], directory: str) -> None:
+    """Check that a job has written the files that it reports.
+
+    Args:
+        promised: URIs of files in the directory.
+        directory: Directory, which is listed once.
+
+    Raises:
+        ValueError: A file is missing. The message names the file.
+    """
+    there = set(list_files(directory, "")) if promised else set()
+    raise_faults({uri: f"{uri}: {MISSING}" for uri in promised if uri not in there}, len(promised))
 
 
 def raise_faults(faults: Mapping[Any, str], count: int) -> None:

@@ -69,6 +69,10 @@ def test_town_in_s3_equals_local_town(s3, tmp_path):
     assert len(local) >= 10 and read_tables(s3.uri("town")) == local
     # Staged scenes, manifests and options are files, too. Each file is written once.
     assert len(writes) <= 1.5 * len(set(writes)) and len(writes) <= 2 * len(local)
+    shard = find_shards(s3.uri("town"))[0]
+    s3.requests.clear()
+    shard.scenes()
+    assert len(s3.requests) <= 12  # Three tables: the size, the head, the end and the columns of each.
     s3.requests.clear()
     assert ingest.ingest_drives(tasks, s3.uri("town"), options).already_complete
     assert not s3.list_writes()
