@@ -13,6 +13,7 @@ reconstruction.py scores reconstructions.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -142,7 +143,12 @@ def compute_set_scores(
 
 
 def run_units(units: Sequence[Unit]) -> dict[str, Any]:
-    """Run computations as Ray tasks, and merge their dictionaries in order.
+    """Run computations as Ray tasks, and merge their dictionaries in order (`map_units`)."""
+    return {name: value for part in map_units(units) for name, value in part.items()}
+
+
+def map_units(units: Sequence[Unit]) -> list[dict[str, Any]]:
+    """Run computations as Ray tasks.
 
     The driver holds neither features nor matrices: a task reads the columns that it uses (`StoredFeatures`).
 
@@ -150,7 +156,7 @@ def run_units(units: Sequence[Unit]) -> dict[str, Any]:
         units: Functions with their arguments.
 
     Returns:
-        All scores.
+        Dictionary of each computation, in order.
     """
     shared: dict[int, Any] = {}
 
@@ -159,15 +165,11 @@ def run_units(units: Sequence[Unit]) -> dict[str, Any]:
             return shared.setdefault(id(value), ray.put(value))
         return value
 
-    tasks = [run_unit.remote(function, *map(share, arguments)) for function, arguments in units]
-    found: dict[str, Any] = {}
-    for part in ray.get(tasks):
-        found |= part
-    return found
+    return ray.get([run_unit.remote(function, *map(share, arguments)) for function, arguments in units])
 
 
 @ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
-def run_unit(function: Callable[..., dict], *arguments: Any) -> dict:
+def run_unit(function: Callable[..., Any], *arguments: Any) -> Any:
     return function(*arguments)
 
 
@@ -263,9 +265,11 @@ def score_sets(
     Returns:
         Scores of each set. Names of validity measures begin with `validity.`.
     """
-    found = {}
+    units = {name: list_set_units(real, side, ground_classes, k) for name, side in sets.items()}
+    parts = iter(map_units([unit for of_set in units.values() for unit in of_set]))
+    found: dict[str, dict[str, Estimate]] = {}
     for name, side in sets.items():
-        scores = compute_set_scores(real, side, ground_classes, k)
+        scores = {key: value for _ in units[name] for key, value in next(parts).items()}
         found[name] = {key: value for key, value in scores.items() if isinstance(value, Estimate)}
         if "validity" in side:
             rates = rate_validity(side)
@@ -324,7 +328,7 @@ def find_sensitive_scores(sets: Mapping[str, Mapping[str, Estimate]]) -> dict[st
 def estimate_frechet(real: np.ndarray, generated: np.ndarray) -> Estimate:
     """Estimate the Frechet distance of two sets of features; both sets are resampled."""
     a, b = compute_moments(real), compute_moments(generated)
-    between = compute_transport(a, b)
+    between = compute_transport(a, b, real)
     by_real, by_generated = compute_influence_maps(b, between)
     influences = [
         compute_frechet_influence(real, a, b.mean, by_real),
@@ -376,44 +380,53 @@ def compute_neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Seq
 
 
 def map_neighbourhoods(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> list[NeighbourhoodScores]:
-    """Run `compute_neighbourhoods` in Ray tasks of ROWS_PER_TASK rows; the tasks share one copy of the features."""
-    sides = prepare_features(real, generated, k)
-    shared = [ray.put(side) for side in sides]
+    """Compute precision, recall, density and coverage in Ray tasks of ROWS_PER_TASK rows; `judge_neighbours`."""
+    sides = [Shared(side) for side in prepare_features(real, generated, k)]
     radii = [
-        np.concatenate(ray.get([compute_radii_task.remote(part, rows, k) for rows in split_rows(len(side))]), axis=1)
-        for part, side in zip(shared, sides, strict=True)
+        Shared(np.concatenate(map_tiles(partial(compute_ball_radii, k=k), len(side.value), side), axis=1))
+        for side in sides
     ]
-    (real_side, generated_side), (real_balls, generated_balls) = shared, [ray.put(part) for part in radii]
-    tasks = [
-        find_within_task.remote(real_side, generated_side, real_balls, generated_balls, rows)
-        for rows in split_rows(len(real))
-    ]
-    return judge_neighbours(k, ray.get(tasks))
+    return judge_neighbours(k, map_tiles(find_within, len(real), *sides, *radii))
 
 
-def split_rows(count: int) -> list[range]:
-    return [range(start, min(start + ROWS_PER_TASK, count)) for start in range(0, count, ROWS_PER_TASK)]
+class Shared:
+    """A value that several Ray tasks use. It is stored once, when the first task needs it."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+    @cached_property
+    def reference(self) -> Any:
+        return ray.put(self.value)
 
 
-@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
-def compute_radii_task(side: FeatureSet, rows: range, k: Sequence[int]) -> np.ndarray:
-    return compute_ball_radii(side, rows, k)
+def map_tiles(function: Callable[..., Any], count: int, *arguments: Shared) -> list[Any]:
+    """Call a function with ranges of ROWS_PER_TASK rows, as Ray tasks if there are several.
+
+    A single range is computed here: a task inside a task would start another process.
+
+    Args:
+        function: Function of the arguments and a range of rows.
+        count: Number of rows.
+        *arguments: Arguments.
+
+    Returns:
+        Results in the order of the rows.
+    """
+    tiles = [range(start, min(start + ROWS_PER_TASK, count)) for start in range(0, count, ROWS_PER_TASK)]
+    if len(tiles) == 1:
+        return [function(*(argument.value for argument in arguments), tiles[0])]
+    references = [argument.reference for argument in arguments]
+    return ray.get([run_unit.remote(function, *[*references, tile]) for tile in tiles])
 
 
-@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
-def find_nearest_task(
+def find_nearest_rows(
     side: FeatureSet, others: FeatureSet, rows: range, count: int, themselves: bool
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Run `find_nearest` in blocks of rows."""
     parts = [find_nearest(side, others, block, count, themselves) for block in iterate_blocks(rows)]
     squared, index = zip(*parts, strict=True)
     return np.concatenate(squared), np.concatenate(index)
-
-
-@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
-def find_within_task(
-    real: FeatureSet, generated: FeatureSet, real_balls: np.ndarray, generated_balls: np.ndarray, rows: range
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return find_within(real, generated, real_balls, generated_balls, rows)
 
 
 def score_nearest_distances(real: Described, generated: Described) -> tuple[str, dict]:
@@ -448,13 +461,12 @@ def compute_nearest_distances(real: np.ndarray, generated: np.ndarray) -> dict:
         real samples; the nearest comes first. `distance` (m, 3): distances from each generated sample to these nearest
         real samples.
     """
-    shared = [ray.put(side) for side in prepare_features(real, generated, (NEIGHBOURS,))]
-    tasks = [
-        find_nearest_task.remote(shared[1], shared[0], rows, NEIGHBOURS, False) for rows in split_rows(len(generated))
-    ]
-    own_tasks = [find_nearest_task.remote(shared[0], shared[0], rows, 1, True) for rows in split_rows(len(real))]
-    squared, index = (np.concatenate(part) for part in zip(*ray.get(tasks), strict=True))
-    own = np.sqrt(np.concatenate([part[0][:, 0] for part in ray.get(own_tasks)]))
+    sides = [Shared(side) for side in prepare_features(real, generated, (NEIGHBOURS,))]
+    find_others = partial(find_nearest_rows, count=NEIGHBOURS, themselves=False)
+    found_others = map_tiles(find_others, len(generated), sides[1], sides[0])
+    squared, index = (np.concatenate(part) for part in zip(*found_others, strict=True))
+    find_own = partial(find_nearest_rows, count=1, themselves=True)
+    own = np.sqrt(np.concatenate([part[0][:, 0] for part in map_tiles(find_own, len(real), sides[0], sides[0])]))
     distance = np.sqrt(squared)
     found = {}
     for name, values in (("generated", distance[:, 0]), ("real", own)):

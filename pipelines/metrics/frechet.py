@@ -133,20 +133,22 @@ class Transport:
     allowed.
 
     Attributes:
-        roots: (d,) s.
-        factor: (d, d) matrix product F U.
+        roots: (r,) s.
+        factor: (d, r) matrix product F U.
     """
 
     roots: np.ndarray
     factor: np.ndarray
 
 
-def compute_transport(a: Gaussian, b: Gaussian) -> Transport:
+def compute_transport(a: Gaussian, b: Gaussian, samples: np.ndarray | None = None) -> Transport:
     """Decompose the product of two covariances for their Frechet distance.
 
     Args:
         a: Gaussian with covariance A.
         b: Gaussian with covariance B.
+        samples: (n, d) features with covariance A. If n < d, the eigenproblem then has n instead of d dimensions,
+            because F is the matrix of the centred samples, divided by the root of n - 1.
 
     Returns:
         Decomposition, as defined in `Transport`.
@@ -157,8 +159,11 @@ def compute_transport(a: Gaussian, b: Gaussian) -> Transport:
     if a.mean.shape != b.mean.shape:
         raise ValueError(f"features have {len(a.mean)} and {len(b.mean)} dimensions; both sides need the same")
     covariance_b = b.covariance
-    values, vectors = np.linalg.eigh(a.covariance)
-    factor = vectors * np.sqrt(np.maximum(values, 0))
+    if samples is not None and len(samples) < len(a.mean):
+        factor = (samples - a.mean).T / np.sqrt(len(samples) - 1)
+    else:
+        values, vectors = np.linalg.eigh(a.covariance)
+        factor = vectors * np.sqrt(np.maximum(values, 0))
     squares, rotation = np.linalg.eigh(factor.T @ covariance_b @ factor)
     return Transport(np.sqrt(np.maximum(squares, 0)), factor @ rotation)
 
