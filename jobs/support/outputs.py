@@ -6,6 +6,7 @@ Each job enters `hold_output` before its first write.
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import threading
@@ -20,6 +21,9 @@ from pipelines.runtime.resources import ResourcePolicy, set_resource_policy
 from pipelines.runtime.shared_storage import require_shared_storage
 from pipelines.schema.lease import LIFETIME_S, IfBusy, Lease, Owner
 
+logger = logging.getLogger(__name__)
+
+NODES_S = 5.0  # Time between two searches for new nodes.
 LIFETIME_VARIABLE = "PRITTI_LEASE_SECONDS"  # Time after which the lease of a silent job expires.
 JOB_VARIABLE = "RAY_JOB_CONFIG_JSON_ENV_VAR"  # Ray sets this variable in submitted jobs.
 
@@ -65,7 +69,7 @@ _reasons: list[str] = []  # Reason for a SIGTERM that this process sends to itse
 
 
 def _stop_job(message: str) -> None:
-    """Stop this job from the thread of a lease."""
+    """Stop this job from another thread."""
     _reasons.append(message)
     os.kill(os.getpid(), signal.SIGTERM)
 
@@ -108,6 +112,40 @@ def hold_lease(output: str, name: str, if_busy: IfBusy = "refuse") -> Iterator[N
 
 
 @contextmanager
+def watch_new_nodes(output: str, checked: set[str]) -> Iterator[None]:
+    """Check nodes that join the cluster while the body runs; stop the job if a node does not share the output.
+
+    Args:
+        output: Directory or URI to which tasks write.
+        checked: Ids of the nodes that need no check.
+
+    Yields:
+        None.
+    """
+    done = threading.Event()
+
+    def watch() -> None:
+        known = checked
+        while not done.wait(NODES_S):
+            try:
+                known = known | require_shared_storage(output, known)
+            except ValueError as error:
+                if not done.is_set():
+                    _stop_job(str(error))
+                return
+            except Exception as error:  # The cluster or the storage does not answer; the job itself will notice.
+                logger.debug("new nodes were not checked: %s", error)
+
+    thread = threading.Thread(target=watch, name="new-nodes", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join(NODES_S)  # Let a check that runs delete its markers.
+
+
+@contextmanager
 def hold_output(output: str, name: str, options: object = None, training: bool = False) -> Iterator[None]:
     """Start Ray, check that all nodes share an output, and hold the right to write to it while the body runs.
 
@@ -127,8 +165,9 @@ def hold_output(output: str, name: str, options: object = None, training: bool =
     """
     policy = ResourcePolicy(getattr(options, "gpus", None), getattr(options, "wait_for_resources_s", 0.0))
     start_ray(training)
-    require_shared_storage(output)
-    with set_resource_policy(policy), hold_lease(output, name, getattr(options, "if_busy", "refuse")):
+    if_busy: IfBusy = getattr(options, "if_busy", "refuse")
+    nodes = require_shared_storage(output)
+    with set_resource_policy(policy), hold_lease(output, name, if_busy), watch_new_nodes(output, nodes):
         yield
 
 

@@ -96,6 +96,8 @@ def train_worker(run: TrainingRun) -> None:
     weight = len(positions) * world / run.stream.batch_size
     started, logged, waited, saved = time.perf_counter(), trainer.steps_done, 0.0, False
     told = -TELL_S
+    if rank == 0:
+        print(f"{run.name}: {world} worker{'s' * (world != 1)}, from step {trainer.steps_done}", flush=True)
     feed = measure_waiting(iterate_batches(run.stream, run.reader, trainer.steps_done, run.settings.steps, rank, world))
     for batch, seconds in feed:
         waited += seconds

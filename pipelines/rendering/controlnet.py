@@ -23,6 +23,7 @@ from pipelines.schema.run_guard import find_changed_option
 
 # Sky colour of the KITTI-360 and Cityscapes palette. Empty pixels of a street view get this colour.
 SKY = (70, 130, 180)
+SUMMARIES = ("photos.png", "photos.webp")  # Contact sheet and animation of a drive.
 MULTIPLE_PX = 8  # The width and height of the network's images are multiples of this value.
 
 
@@ -150,10 +151,8 @@ class StreetPainter:
                 storage.write_whole(path, lambda stream, content=content: stream.write(content))
             frames.append(np.asarray(Image.open(io.BytesIO(storage.read_bytes(path)))))
         every = frames[:: -(-len(frames) // ON_SHEET)]
-        for name, content in {
-            "photos.png": encode_png(arrange_contact_sheet(every, 3)),
-            "photos.webp": encode_animation(frames),
-        }.items():
+        contents = (encode_png(arrange_contact_sheet(every, 3)), encode_animation(frames))
+        for name, content in zip(SUMMARIES, contents, strict=True):
             storage.write_whole(
                 storage.join_uri(directory, name), lambda stream, content=content: stream.write(content)
             )
@@ -208,7 +207,7 @@ def paint_streets(
         Number of frames.
 
     Raises:
-        ValueError: A drive has photographs with other options.
+        ValueError: A drive has photographs with other options, or a photograph is missing at the end.
     """
     for directory in directories:
         record = storage.join_uri(directory, "photos.json")
@@ -222,4 +221,8 @@ def paint_streets(
         total += row["frames"]
         if on_drive:
             on_drive()
+    for directory in directories:
+        photos = [storage.join_uri(directory, "photo", name) for name in list_frame_names(directory)]
+        photos += [storage.join_uri(directory, name) for name in SUMMARIES]
+        storage.require_files(photos, directory)
     return total

@@ -27,6 +27,7 @@ from pipelines.schema.scene_subset import SceneSubset
 DEPTH_PER_M = 256
 FRAMES_PER_SECOND = 10
 ON_SHEET = 24
+KINDS = ("semantic", "class_id", "instance", "depth", "shaded")  # Images of each frame.
 
 
 @dataclass(frozen=True)
@@ -55,16 +56,30 @@ class StreetRequest:
     right: float
     most: int | None
 
-    def directory(self, scene: Scene) -> str:
+    def directory(self, scene_id: str) -> str:
         """Return the output directory of a scene.
 
         Args:
-            scene: Scene.
+            scene_id: Id of the scene.
 
         Returns:
             Path or URI.
         """
-        return storage.join_uri(self.output, "streets", self.run, make_file_name(scene.scene_id))
+        return storage.join_uri(self.output, "streets", self.run, make_file_name(scene_id))
+
+    def list_files(self, scene_id: str, count: int) -> list[str]:
+        """Return the files of a scene.
+
+        Args:
+            scene_id: Id of the scene.
+            count: Number of frames.
+
+        Returns:
+            Paths or URIs of all files, of which cameras.json is written last.
+        """
+        names = [f"{kind}/{number:06d}.png" for kind in KINDS for number in range(count)]
+        names += ["sheet.png", "drive.webp"] if count else []
+        return [storage.join_uri(self.directory(scene_id), name) for name in (*names, "cameras.json")]
 
 
 def place_cameras(way_m: np.ndarray, request: StreetRequest) -> list[StreetCamera]:
@@ -147,16 +162,15 @@ def write_street(scene: Scene, request: StreetRequest) -> int:
     Returns:
         Number of frames; 0 if the scene has no road.
     """
-    directory, renderer = request.directory(scene), StreetRenderer(scene)
+    directory, renderer = request.directory(scene.scene_id), StreetRenderer(scene)
     way_m = plan_drive(extract_road_network(scene), right=request.right)
     cameras = place_cameras(way_m, request) if len(way_m) > 1 else []
     frames = []
     for number, camera in enumerate(cameras):
         view = renderer.view(camera)
         frames.append(shade_view(view))
-        images = {"semantic": view.semantic, "class_id": view.class_id, "instance": view.instance()}
-        images |= {"depth": encode_depth(view), "shaded": frames[-1]}
-        for kind, image in images.items():
+        images = (view.semantic, view.class_id, view.instance(), encode_depth(view), frames[-1])
+        for kind, image in zip(KINDS, images, strict=True):
             path = storage.join_uri(directory, kind, f"{number:06d}.png")
             storage.write_whole(path, lambda stream, image=image: stream.write(encode_png(image)))
     if frames:
@@ -191,7 +205,8 @@ def render_streets(
         Number of frames for each scene id; 0 for a scene without a road.
 
     Raises:
-        ValueError: The output holds a run with the same name but other cameras, or no scene has a road.
+        ValueError: The output holds a run with the same name but other cameras, no scene has a road, or a file is
+            missing at the end.
     """
     record = storage.join_uri(request.output, "streets", f"{request.run}.json")
     if said := find_changed_option(record, asdict(request)):
@@ -202,9 +217,12 @@ def render_streets(
     def write(row: dict) -> dict:
         shard, position = chosen[row["id"]]
         (scene,) = shard.scenes([position])
-        done = storage.join_uri(request.directory(scene), "cameras.json")
-        count = len(storage.read_json(done)["frames"]) if storage.exists(done) else write_street(scene, request)
-        return {"scene_id": scene.scene_id, "frames": count}
+        there = set(storage.list_files(directory := request.directory(scene.scene_id), ""))
+        if (cameras := storage.join_uri(directory, "cameras.json")) in there:
+            count = len(storage.read_json(cameras)["frames"])
+            if there.issuperset(request.list_files(scene.scene_id, count)):
+                return {"scene_id": scene.scene_id, "frames": count}
+        return {"scene_id": scene.scene_id, "frames": write_street(scene, request)}
 
     frames = {}
     for row in map_rows(make_numbered_rows(range(len(chosen))), write).iter_rows():
@@ -213,4 +231,6 @@ def render_streets(
             on_scene()
     if not any(frames.values()):
         raise ValueError(f"none of the {len(frames)} scenes has a road; street views need the ground class road")
+    written = [path for scene_id, count in frames.items() for path in request.list_files(scene_id, count)]
+    storage.require_files(written, storage.join_uri(request.output, "streets", request.run))
     return frames

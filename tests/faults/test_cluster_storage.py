@@ -54,6 +54,22 @@ def test_output_that_nodes_do_not_share_stops_the_job(folder, tmp_path):
         assert not [path for path in output.rglob("*") if path.is_file()]
 
 
+@pytest.mark.slow
+def test_unshared_node_that_joins_later_stops_the_job(folder, tmp_path):
+    output = tmp_path / "output"
+    output.mkdir()
+    with run_cluster(Cluster(folder, output, dict(os.environ)), 1) as cluster:
+        words = [sys.executable, "jobs/preprocess_scenes.py", "town", "--num-train", "2000"]
+        words += ["--output", str(output / "town")]
+        driver = subprocess.Popen(words, cwd=ROOT, env=cluster.environment, stderr=subprocess.PIPE, text=True)
+        while driver.poll() is None and not storage.list_files(str(output), ".parquet"):
+            time.sleep(0.1)
+        cluster.start_raylet(1)
+        errors = driver.communicate(timeout=200)[1]
+        assert driver.returncode == 1 and re.search(rf"\(127.0.0.2, \w+\) does not share {output}/town with", errors)
+        assert not list(output.rglob(".node-*"))
+
+
 def test_chain_on_s3_survives_loss_of_a_node(folder, cluster, tmp_path, monkeypatch):
     import ray
 

@@ -7,13 +7,15 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from helpers import ROOT
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
-from raylets import Cluster, kill_family, run_cluster
+from raylets import RAY, Cluster, kill_family, run_cluster
 
 TRAIN = [sys.executable, str(ROOT / "jobs/train_lvae.py"), "smoke"]
 SAMPLE = [sys.executable, str(ROOT / "jobs/sample_scenes.py"), "--num-scenes", "2", "--num-inference-steps", "2"]
@@ -52,6 +54,16 @@ def make_environment(tmp_path: Path, **more: str) -> dict[str, str]:
     return environment
 
 
+def wait_for_line(process: subprocess.Popen, pattern: str) -> re.Match:
+    """Read the output of a process until a line matches."""
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if found := re.search(pattern, line):
+            return found
+    raise AssertionError("".join(lines[-50:]))
+
+
 def test_gpus_that_torch_cannot_use_are_an_error(folder, tmp_path):
     with run_cluster(Cluster(folder, None, make_environment(tmp_path)), 1, num_gpus=1) as cluster:
 
@@ -78,17 +90,9 @@ def test_stopped_training_is_killed_in_mlflow_and_resumes(tmp_path):
             words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1
         )
 
-    def wait_for(process: subprocess.Popen, pattern: str) -> str:
-        lines = []
-        for line in process.stdout:
-            lines.append(line)
-            if re.search(pattern, line):
-                return line
-        raise AssertionError("".join(lines[-50:]))
-
     first = start()
     try:
-        wait_for(first, r"step 24/200")
+        wait_for_line(first, r"step 24/200")
         second = subprocess.run([*TRAIN, "--steps", "200"], env=environment, capture_output=True, text=True)
         assert second.returncode == 2 and "writes 'lvae-smoke' here" in second.stderr  # never two trainings of a run
         first.send_signal(signal.SIGTERM)
@@ -105,8 +109,7 @@ def test_stopped_training_is_killed_in_mlflow_and_resumes(tmp_path):
     assert read_run().info.status == "KILLED"
     again = start()
     try:
-        line = wait_for(again, r"step \d+/200")
-        assert int(re.search(r"step (\d+)/", line)[1]) > 20
+        assert int(wait_for_line(again, r"step (\d+)/200")[1]) > 20
         assert read_run().info.status == "RUNNING"
         again.send_signal(signal.SIGKILL)
     finally:
@@ -114,6 +117,75 @@ def test_stopped_training_is_killed_in_mlflow_and_resumes(tmp_path):
     assert read_run().info.status == "RUNNING"  # a killed driver cannot change it
     close_dead_runs(api, api.get_experiment_by_name("pritti-lvae").experiment_id)  # as each job does at its start
     assert read_run().info.status == "KILLED"
+
+
+@contextmanager
+def train_elastically(
+    folder: Path, tmp_path: Path, checkpoint_every: int
+) -> Iterator[tuple[Cluster, subprocess.Popen]]:
+    """Train with one or two workers on three nodes of one CPU each."""
+    environment = make_environment(tmp_path, RAY_TRAIN_HEALTH_CHECK_INTERVAL_S="0.5")
+    with run_cluster(Cluster(folder, None, environment), 3) as cluster:
+        words = [*TRAIN, "--steps", "4000", "--checkpoint-every", str(checkpoint_every), "--num-workers", "2"]
+        process = subprocess.Popen(
+            [*words, "--min-workers", "1"],
+            env=cluster.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        try:
+            yield cluster, process
+        finally:
+            kill_family(process)
+
+
+@pytest.mark.slow
+def test_training_loses_nodes_and_regains_them(folder, tmp_path):
+    with train_elastically(folder, tmp_path, 8) as (cluster, process):
+        wait_for_line(process, "lvae-smoke: 2 workers, from step 0")
+        wait_for_line(process, r"step 24/4000")
+        cluster.kill_raylet(1)
+        cluster.kill_raylet(2)
+        fewer = wait_for_line(process, r"lvae-smoke: 1 worker, from step (\d+)")
+        assert int(fewer[1]) >= 16
+        cluster.start_raylet(1)
+        cluster.start_raylet(2)
+        more = wait_for_line(process, r"lvae-smoke: 2 workers, from step (\d+)")
+        assert int(more[1]) > int(fewer[1])
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 1
+
+
+@pytest.mark.slow
+def test_notice_of_preemption_saves_a_checkpoint(folder, tmp_path):
+    with train_elastically(folder, tmp_path, 4000) as (cluster, process):
+        wait_for_line(process, r"step 24/4000")
+        runs = tmp_path / "home/runs/lvae-smoke"
+        assert not list(runs.glob("checkpoint_*"))
+        for number in (1, 2):
+            drain(cluster, number)
+        end = time.monotonic() + 60
+        while not list(runs.glob("checkpoint_*")):
+            assert time.monotonic() < end and process.poll() is None
+            time.sleep(0.2)
+        for number in (1, 2):  # The cloud takes the nodes.
+            cluster.kill_raylet(number)
+        fewer = wait_for_line(process, r"lvae-smoke: 1 worker, from step (\d+)")
+        assert int(fewer[1]) >= 24
+
+
+def drain(cluster: Cluster, number: int) -> None:
+    """Announce that a node will be taken away in 60 s, as KubeRay and cloud autoscalers do."""
+    code = (
+        "import sys, ray\nray.init(logging_level='ERROR')\n"
+        "print([n['NodeID'] for n in ray.nodes() if n['NodeManagerAddress'] == sys.argv[1]][0])"
+    )
+    words = [sys.executable, "-c", code, f"127.0.0.{number + 1}"]
+    found = subprocess.run(words, env=cluster.environment, capture_output=True, text=True, check=True)
+    words = [RAY, "drain-node", "--address", cluster.environment["RAY_ADDRESS"], "--node-id", found.stdout.split()[-1]]
+    words += ["--reason", "DRAIN_NODE_REASON_PREEMPTION", "--reason-message", "test"]
+    subprocess.run([*words, "--deadline-remaining-seconds", "60"], env=cluster.environment, check=True)
 
 
 def test_missing_nodes_come_from_the_autoscaler(folder, tmp_path):

@@ -1,5 +1,7 @@
 """Tests of jobs/edit_scenes.py on Ray."""
 
+from pathlib import Path
+
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -46,6 +48,11 @@ def test_edit_job_edits_table_and_replays(table, town_scenes, tmp_path, cluster)
     part = next((tmp_path / "out" / "scenes" / "source=edited-bare" / "split=test").glob("*.parquet"))
     written = part.stat().st_mtime_ns
     assert edit_scenes(trees) == made and part.stat().st_mtime_ns == written  # a second run writes no file
+    for table_name in ("primitives", "rasters"):  # It writes a damaged shard again.
+        lost = Path(Shard(options["output"], "edited-bare", "test", 1).path(table_name))
+        whole = pq.read_table(lost, partitioning=None)
+        lost.write_bytes(lost.read_bytes()[:-50])
+        assert edit_scenes(trees) == made and pq.read_table(lost, partitioning=None).equals(whole)
     with pytest.raises(ValueError, match="holds a run 'bare' with other edits; choose another --run"):
         edit_scenes(Remove(category=("pole",), **options))
 

@@ -48,6 +48,9 @@ def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluste
     assert (ids[instances > 0] == CATEGORY_IDS[town_scenes[0].category[instances[instances > 0] - 1]]).all()
     written = (where / "sheet.png").stat().st_mtime_ns
     assert render(options) == frames and (where / "sheet.png").stat().st_mtime_ns == written
+    lost = where / "depth" / "000001.png"
+    lost.unlink()  # The second run writes missing files again.
+    assert render(options) == frames and lost.exists()
     with pytest.raises(ValueError, match=r"run 'drive' with spacing_m=8.0, asked for 2.0; choose another --run"):
         render(replace(options, spacing_m=2.0))
 

@@ -60,6 +60,10 @@ def test_import_meshes_writes_tables_of_same_scenes(cluster, tmp_path, town_scen
     assert import_scenes(config)[1]["rejects"] == 0
     assert len(list(read_scenes(str(output)))) == 6 and not list((output / "rejects").rglob("*.parquet"))
     assert kept.stat().st_mtime_ns == stamp
+    whole = kept.read_bytes()
+    kept.write_bytes(whole[:-50])  # The same command writes a damaged shard again.
+    import_scenes(config)
+    assert kept.read_bytes() == whole
     (meshes / "night/6.glb").write_bytes(good)
     with pytest.raises(ValueError, match=r"holds an import 'theirs' with other files; choose another"):
         import_scenes(config)
