@@ -144,7 +144,7 @@ def train_elastically(
 def test_training_loses_nodes_and_regains_them(folder, tmp_path):
     with train_elastically(folder, tmp_path, 8) as (cluster, process):
         wait_for_line(process, "lvae-smoke: 2 workers, from step 0")
-        wait_for_line(process, r"step 24/4000")
+        wait_for_line(process, r"step \d+/4000")
         cluster.kill_raylet(1)
         cluster.kill_raylet(2)
         fewer = wait_for_line(process, r"lvae-smoke: 1 worker, from step (\d+)")
@@ -160,7 +160,7 @@ def test_training_loses_nodes_and_regains_them(folder, tmp_path):
 @pytest.mark.slow
 def test_notice_of_preemption_saves_a_checkpoint(folder, tmp_path):
     with train_elastically(folder, tmp_path, 4000) as (cluster, process):
-        wait_for_line(process, r"step 24/4000")
+        wait_for_line(process, r"step \d+/4000")
         runs = tmp_path / "home/runs/lvae-smoke"
         assert not list(runs.glob("checkpoint_*"))
         for number in (1, 2):
