@@ -23,7 +23,7 @@ RAY_ENVIRONMENT = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_TRAIN_ENABLE_PRINT_PATCH": "0",
     "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.5",
-    "RAY_TRAIN_WORKER_GROUP_START_TIMEOUT_S": "300",  # Importing torch takes a minute on a busy machine or slow disk.
+    "RAY_TRAIN_WORKER_GROUP_START_TIMEOUT_S": "30",  # After the loss of a node, Ray may first ask for lost CPUs.
     # Without this value, Ray kills the reader process after every read if there are few CPUs. The next reader
     # process then needs 10 s for imports.
     "RAY_idle_worker_killing_time_threshold_ms": "300000",
