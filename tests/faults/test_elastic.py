@@ -161,18 +161,22 @@ def test_training_loses_nodes_and_regains_them(folder, tmp_path):
 def test_notice_of_preemption_saves_a_checkpoint(folder, tmp_path):
     with train_elastically(folder, tmp_path, 4000) as (cluster, process):
         wait_for_line(process, r"step \d+/4000")
-        runs = tmp_path / "home/runs/lvae-smoke"
-        assert not list(runs.glob("checkpoint_*"))
+        record = tmp_path / "home/runs/lvae-smoke/checkpoint_manager_snapshot.json"  # Ray Train's list of checkpoints
+
+        def has_checkpoint() -> bool:
+            return record.exists() and "checkpoint_2" in record.read_text()  # the names begin with the year
+
+        assert not has_checkpoint()
         for number in (1, 2):
             drain(cluster, number)
         end = time.monotonic() + 60
-        while not list(runs.glob("checkpoint_*")):
+        while not has_checkpoint():
             assert time.monotonic() < end and process.poll() is None
             time.sleep(0.2)
         for number in (1, 2):  # The cloud takes the nodes.
             cluster.kill_raylet(number)
         fewer = wait_for_line(process, r"lvae-smoke: 1 worker, from step (\d+)")
-        assert int(fewer[1]) >= 24
+        assert int(fewer[1]) >= 50
 
 
 def drain(cluster: Cluster, number: int) -> None:
