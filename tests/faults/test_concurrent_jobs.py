@@ -68,3 +68,17 @@ def test_second_job_is_refused_or_waits_and_takes_over(tmp_path, job):
         for path in (output, tmp_path / "whole")
     )
     assert made == whole and len(made) >= 6
+
+
+@pytest.mark.slow
+def test_joined_job_waits_and_reports_the_same_result(tmp_path):
+    output = tmp_path / "made"
+    first = start("preprocess", output)
+    try:
+        wait_until(lambda: list(output.glob(".leases/*/*.json")))
+        joined = start("preprocess", output, "--if-busy", "join")
+        texts = [process.communicate(timeout=200)[0] for process in (first, joined)]
+    finally:
+        kill_family(first)
+    assert first.returncode == joined.returncode == 0, texts
+    assert f"waiting for job {first.pid} on " in texts[1] and "already complete" in texts[1]

@@ -64,6 +64,7 @@ def wait_for_line(process: subprocess.Popen, pattern: str) -> re.Match:
     raise AssertionError("".join(lines[-50:]))
 
 
+@pytest.mark.slow
 def test_gpus_that_torch_cannot_use_are_an_error(folder, tmp_path):
     with run_cluster(Cluster(folder, None, make_environment(tmp_path)), 1, num_gpus=1) as cluster:
 
@@ -79,6 +80,7 @@ def test_gpus_that_torch_cannot_use_are_an_error(folder, tmp_path):
         assert sample("--gpus", "0", "--log-format", "json").returncode == 0
 
 
+@pytest.mark.slow
 def test_stopped_training_is_killed_in_mlflow_and_resumes(tmp_path):
     from jobs.support.tracking import close_dead_runs, make_client
 

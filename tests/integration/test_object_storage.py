@@ -22,6 +22,7 @@ from models.uris import join_uri, resolve_uri
 from pipelines.preprocess import ingest
 from pipelines.preprocess.sharding import plan_argoverse2, plan_custom, plan_kitti360, plan_town
 from pipelines.runtime import storage
+from pipelines.schema.lease import Lease, LeaseError, Owner
 from pipelines.schema.tables import find_shards
 
 
@@ -186,6 +187,27 @@ def test_create_file_has_one_winner(s3):
     [thread.start() for thread in threads]
     [thread.join() for thread in threads]
     assert sorted(wins) == [False] * 7 + [True]
+
+
+def test_lease_in_s3_expires_by_the_clock_of_the_store(s3, monkeypatch):
+    def make_lease(job: str, host: str) -> Lease:
+        owner = replace(Owner.of_this_process(job), machine=host, host=host)
+        return Lease(s3.uri("leased"), "run", owner, print, lifetime_s=3.0)
+
+    silent, other = make_lease("job-1", "a"), make_lease("job-2", "b")
+    monkeypatch.setattr(Lease, "_keep", lambda self: None)  # no heartbeats
+    silent.acquire()
+    with monkeypatch.context() as clock:
+        clock.setattr(time, "time", lambda: 3600.0)  # The clock of this machine is wrong.
+        with pytest.raises(LeaseError, match="job job-1 on a writes 'run' here"):
+            other.acquire()
+    lines: list[str] = []
+    other.acquire("wait", lines.append)
+    assert len(lines) == 1 and "waiting for job job-1 on a" in lines[0]
+    assert "job job-2 on b has taken over" in silent._beat()
+    with pytest.raises(LeaseError, match="job job-2 on b"):
+        make_lease("job-3", "a").acquire()
+    other.release("finished")
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """Tests of leases: an output has one writer, also if a writer was killed or clocks differ."""
 
+import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -117,3 +119,18 @@ def test_process_ids_are_recognised_after_reuse():
     assert machines.is_process_alive(os.getpid(), machines.find_start_time(os.getpid()))
     assert not machines.is_process_alive(os.getpid(), "1")
     assert not machines.is_process_alive(2**31 - 1)
+
+
+def test_sigterm_stops_the_job_and_ends_its_lease_as_killed(tmp_path):
+    from jobs.support.outputs import JobStopped, hold_lease
+
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(JobStopped, match=r"the job was stopped \(SIGTERM\)"), hold_lease(str(tmp_path), "run"):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(30)
+    assert signal.getsignal(signal.SIGTERM) == before
+    (record,) = tmp_path.glob(".leases/*/*.json")
+    assert json.loads(record.read_text())["state"] == "killed"
+    joined = make_lease(tmp_path, "job-2")
+    joined.acquire("join")  # An ended job is not waited for.
+    joined.release("finished")
