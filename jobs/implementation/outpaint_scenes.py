@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from math import ceil
 
-import pyarrow as pa
 from rich.progress import MofNCompleteColumn, Progress
 
 from jobs.implementation.checks import check_outpaint_scenes
@@ -14,6 +13,7 @@ from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import make_repaint_config, select_scenes
 from pipelines.generation.outpaint import HARDLY_KNOWN, OutpaintRequest, outpaint_scenes
+from pipelines.runtime import storage
 
 BLOCK_M = 64.0  # size of the scenes in every dataset (paper, Sec. 3.1)
 
@@ -43,8 +43,8 @@ def count_blocks(config: Config) -> tuple[int, int, int, int]:
     return counts
 
 
-def outpaint(config: Config) -> pa.Table:
-    """Extend scenes, write them, and return the block table with the share of known ground in each block."""
+def outpaint(config: Config) -> list[str]:
+    """Extend scenes and write them; return the path of each scene's table with the known ground in each block."""
     counts = count_blocks(config)
     check_outpaint_scenes(config)
     selection = select_scenes(config)
@@ -71,10 +71,12 @@ def outpaint(config: Config) -> pa.Table:
 
 
 def main(config: Config) -> None:
-    blocks, output = outpaint(config), config.output_directory()
+    tables, output = outpaint(config), config.output_directory()
+    known = [storage.read_parquet(path, ["known_ground"])["known_ground"].to_numpy() for path in tables]
+    bare, count = sum(int((share < HARDLY_KNOWN).sum()) for share in known), sum(map(len, known))
     print(f"outpainted scenes, source generated-{config.run}, and GLB files in {output}")
-    if bare := int((blocks["known_ground"].to_numpy() < HARDLY_KNOWN).sum()):
+    if bare:
         print(
-            f"{bare} of {len(blocks)} blocks had almost no known ground, so their outpainting failed, as in the paper; "
+            f"{bare} of {count} blocks had almost no known ground, so their outpainting failed, as in the paper; "
             f"their known_ground is below {HARDLY_KNOWN} in {output}/block_tables/{config.run}/*.parquet"
         )

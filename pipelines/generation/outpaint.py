@@ -320,7 +320,7 @@ def outpaint_scenes(
     selection: SceneSubset,
     num_actors: int = 1,
     on_blocks: Callable[[int], None] | None = None,
-) -> pa.Table:
+) -> list[str]:
     """Extend the selected scenes; resume an interrupted run.
 
     Args:
@@ -330,7 +330,7 @@ def outpaint_scenes(
         on_blocks: Called with the number of blocks that finished since the previous call.
 
     Returns:
-        Table with one row per block.
+        Path of the table of blocks of each scene (`make_blocks_table_path`), in order.
 
     Raises:
         ValueError: The output contains a run of the same name with other options.
@@ -355,9 +355,7 @@ def outpaint_scenes(
     if done:
         run_batches(request, chosen, waiting, done, num_actors, on_blocks)
     require_written(promised)
-    return pa.concat_tables(
-        storage.read_parquet(make_blocks_table_path(request, number)) for number in range(len(chosen))
-    )
+    return [make_blocks_table_path(request, number) for number in range(len(chosen))]
 
 
 def run_batches(

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from helpers import ROOT
+from test_faults import read_directory
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 from raylets import RAY, Cluster, kill_family, run_cluster
@@ -192,6 +193,30 @@ def drain(cluster: Cluster, number: int) -> None:
     words = [RAY, "drain-node", "--address", cluster.environment["RAY_ADDRESS"], "--node-id", found.stdout.split()[-1]]
     words += ["--reason", "DRAIN_NODE_REASON_PREEMPTION", "--reason-message", "test"]
     subprocess.run([*words, "--deadline-remaining-seconds", "60"], env=cluster.environment, check=True)
+
+
+@pytest.mark.slow
+def test_same_command_resumes_after_loss_of_the_head(folder, tmp_path):
+    """The head dies with all nodes, as in a power cut; a new head is a new cluster."""
+    words = [sys.executable, str(ROOT / "jobs/preprocess_scenes.py"), "town", "--num-train", "512", "--output"]
+    cluster = Cluster(folder, None, make_environment(tmp_path))
+    environment = dict(cluster.environment)
+    with run_cluster(cluster, 1, num_cpus=2):
+        log = (tmp_path / "driver.log").open("w")
+        driver = subprocess.Popen(
+            [*words, str(tmp_path / "lost")], env=cluster.environment, stdout=log, stderr=subprocess.STDOUT
+        )
+        while driver.poll() is None and not list((tmp_path / "lost").rglob("*.parquet")):
+            time.sleep(0.05)
+        cluster.kill_raylet(0)
+        assert driver.wait(180) != 0  # The driver does not wait for the dead head forever.
+    (folder / "next").mkdir()
+    with run_cluster(Cluster(folder / "next", None, environment), 1, num_cpus=2) as cluster:
+        for name in ("lost", "whole"):
+            subprocess.run([*words, str(tmp_path / name)], env=cluster.environment, check=True, timeout=200)
+    found = {name: read_directory(tmp_path / name) for name in ("lost", "whole")}
+    tables = [{name: part for name, part in files.items() if name.endswith(".parquet")} for files in found.values()]
+    assert tables[0] == tables[1] and len(tables[0]) >= 6
 
 
 def test_missing_nodes_come_from_the_autoscaler(folder, tmp_path):

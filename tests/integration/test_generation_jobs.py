@@ -5,12 +5,14 @@ from pathlib import Path
 
 import duckdb
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import trimesh
 from helpers import kill_ray_workers
 
 from models.scene import DENSITIES
+from pipelines.runtime import storage
 from pipelines.schema.tables import find_shards, read_scenes
 
 
@@ -235,8 +237,11 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
         made = OutpaintRequest(model, str(tmp_path / name), "street", None, 0, 0.25, "reencode", repaint, 1.0)
         return replace(made, **{"num_blocks": (3, 0, 0, 1), "order": "colours", "batch_size": 2} | options)
 
+    def run(name: str, **options) -> pa.Table:
+        return pa.concat_tables(map(storage.read_parquet, outpaint_scenes(request(name), chosen, **options)))
+
     chosen = SceneSubset(str(samples), "generated-samples", None, 1, "first")
-    table = outpaint_scenes(request("whole"), chosen)
+    table = run("whole")
     assert len(table) == 8 and set(table.column_names) >= {"ahead", "left", "datum_m", "known_ground"}
     (whole,) = read_scenes(str(tmp_path / "whole"))
     assert (whole.grid.rows, whole.grid.cols) == (32 + 3 * 24, 32 + 24)
@@ -248,7 +253,7 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
         if sum(counts) and not killed:
             killed.extend(kill_ray_workers("Outpainter"))
 
-    assert outpaint_scenes(request("killed"), chosen, num_actors=3, on_blocks=kill).equals(table)
+    assert run("killed", num_actors=3, on_blocks=kill).equals(table)
     assert killed and counts[0] == 0 and sum(counts) == 7
 
     class Stop(Exception):
@@ -261,12 +266,13 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
     with pytest.raises(Stop):
         outpaint_scenes(request("resumed"), chosen, on_blocks=stop)
     left = []
-    assert outpaint_scenes(request("resumed"), chosen, on_blocks=left.append).equals(table) and left[0] > 0
+    assert run("resumed", on_blocks=left.append).equals(table) and left[0] > 0
     for name in ("killed", "resumed"):
         (again,) = read_scenes(str(tmp_path / name))
         for part in ("category", "center_m", "size_m", "height_m", "occupied"):
             assert np.array_equal(getattr(again, part), getattr(whole, part)), (name, part)
-    (outward,) = outpaint_scenes(request("outward", order="outward", num_blocks=(1, 0, 0, 0)), chosen).to_pylist()[1:]
+    (path,) = outpaint_scenes(request("outward", order="outward", num_blocks=(1, 0, 0, 0)), chosen)
+    (outward,) = storage.read_parquet(path).to_pylist()[1:]
     assert outward["ahead"] == 1
     assert count_blocks(Config(extent_m=(512.0, 128.0))) == (7, 7, 1, 1) != count_blocks(Config(extent_m=(64.0, 65.0)))
     for wrong in (
