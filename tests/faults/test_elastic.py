@@ -154,7 +154,8 @@ def test_training_loses_nodes_and_regains_them(folder, tmp_path):
         assert int(fewer[1]) >= 16
         cluster.start_raylet(1)
         cluster.start_raylet(2)
-        more = wait_for_line(process, r"lvae-smoke: 2 workers, from step (\d+)")
+        # New nodes repeat the logs of the lost ones, because all nodes of this machine share a folder for logs.
+        more = wait_for_line(process, r"lvae-smoke: 2 workers, from step ([1-9]\d*)")
         assert int(more[1]) > int(fewer[1])
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 1
