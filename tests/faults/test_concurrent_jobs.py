@@ -76,9 +76,12 @@ def test_joined_job_waits_and_reports_the_same_result(tmp_path):
     first = start("preprocess", output)
     try:
         wait_until(lambda: list(output.glob(".leases/*/*.json")))
+        first.send_signal(signal.SIGSTOP)  # The first job cannot end before the other has found its lease.
         joined = start("preprocess", output, "--if-busy", "join")
+        assert f"waiting for job {first.pid} on " in joined.stdout.readline()
+        first.send_signal(signal.SIGCONT)
         texts = [process.communicate(timeout=200)[0] for process in (first, joined)]
     finally:
         kill_family(first)
     assert first.returncode == joined.returncode == 0, texts
-    assert f"waiting for job {first.pid} on " in texts[1] and "already complete" in texts[1]
+    assert "already complete" in texts[1]
