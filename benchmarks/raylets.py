@@ -169,6 +169,8 @@ class Cluster:
         # Jobs join the node that has their address, 127.0.0.1. This is the head.
         command += [f"--node-ip-address=127.0.0.{number + 1}", "--disable-usage-stats"]
         command += [f"--object-store-memory={OBJECT_STORE_BYTES}"]
+        # Submitted jobs need an agent. The agent of another cluster on this machine may have the usual port.
+        command += [f"--dashboard-agent-listen-port={find_free_port()}"]
         if self.private and number:
             command = ["unshare", "-rm", "sh", "-c", MOUNT, str(self.private), *command]
         path = self.folder / f"node-{number}.log"

@@ -9,7 +9,7 @@ from jobs.support.cli import home_path, make_absolute
 from models.labels import LABELS, require_labels
 from models.options import Choice, check_entries
 from models.pretrained import INDEX_NAME, find_pipeline_path
-from models.uris import split_name
+from models.uris import is_uri, split_name
 from pipelines.runtime import storage
 
 
@@ -61,7 +61,7 @@ def find_pipeline_directory(model: str) -> str:
                 f"specify one of: {', '.join(sorted(found))}"
             )
         return found[0] if found else find_pipeline_path("town")
-    for directory in (make_absolute(model), home_path("zoo", model)):
+    for directory in (make_absolute(model), *([] if is_uri(model) else [home_path("zoo", model)])):
         if storage.exists(storage.join_uri(directory, INDEX_NAME)):
             return directory
     if re.fullmatch(r"models:/.+|[0-9a-f]{32}", model):

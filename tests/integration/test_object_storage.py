@@ -238,6 +238,14 @@ def test_hung_endpoint_ends_with_an_error(s3):
     assert time.monotonic() - started < 60
 
 
+def test_missing_model_is_named(s3, cache, monkeypatch):
+    from jobs.support.model_directories import find_pipeline_directory
+
+    monkeypatch.setenv("PRITTI_HOME", s3.uri("home"))
+    with pytest.raises(ValueError, match=r"^s3://tests/no-model.*: no"):
+        find_pipeline_directory(s3.uri("no-model"))
+
+
 def test_missing_bucket_is_named_when_scenes_are_read(s3):
     root = join_uri("s3://absent-bucket/town?" + s3.uri().partition("?")[2])
     with pytest.raises(ValueError, match="s3://absent-bucket/town/scenes"):

@@ -1,0 +1,172 @@
+"""Submit every job with `ray job submit` to a cluster of two nodes that share no disk, with all files on S3.
+
+    python benchmarks/submit_jobs.py                                        a quarter of an hour on two cores
+    python benchmarks/submit_jobs.py --diffusion DIR --controlnet DIR       also paint_streets
+    python benchmarks/submit_jobs.py --output transcript.md
+
+The S3 server (moto), MLflow and the cluster run on this machine, each node in a mount namespace. Ray uploads the code.
+The script prints each command, the last lines of its output and its duration as Markdown, and ends with exit code 1 if
+a job fails. docs/how_to/cluster.md contains such a transcript.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+import yaml
+from chaos import open_store
+from common import describe_machine
+from raylets import RAY, ROOT, Cluster
+
+HOME = "s3://tests/home"
+SHOWN = 2  # Number of lines of each output.
+# @ is the home directory.
+JOBS = """
+preprocess_scenes town --num-train 48 --num-test 24
+train_lvae smoke --dataset @/datasets/town --name small-lvae --steps 24
+encode_latents --dataset @/datasets/town --lvae @/models/small-lvae
+train_dit smoke --dataset @/datasets/town --name small --steps 24 --num-workers 2
+sample_scenes --model @/models/pritti-small --num-scenes 24 --num-inference-steps 4 --existence-threshold 0.01
+sample_scenes --num-scenes 24 --sampler dpm++ --num-inference-steps 10 --run town --output @/town
+outpaint_scenes --input @/town --guided --num-inference-steps 5
+inpaint_scenes --input @/town --half-plane 1 0 32 --guided --num-inference-steps 5 --output @/inpainted
+edit_scenes remove --category pole --input @/town --output @/edited
+evaluate_scenes --real @/datasets/town --generated @/town --run town --lvae @/models/small-lvae --lite0 False
+evaluate_seams --generated @/outpainted
+export_scenes --input @/town --max-scenes 4 --formats glb npz --output @/exports
+import_scenes @/exports/glb --name theirs --output @/imported
+evaluate_voxels --ground-truth @/exports/npz --reconstructed @/exports/npz --output @/voxels
+render_streets --input @/town --max-scenes 2 --spacing-m 16 --output @/town
+paint_streets --streets @/town/streets/drive --diffusion DIFFUSION --controlnet CONTROLNET --num-inference-steps 2
+inspect_scenes report --dataset @/town --num-examples 2
+publish_model --name small --model @/models/pritti-small --evaluation @/evaluations/town --output @/zoo
+sample_scenes --model models:/small/1 --num-scenes 4 --num-inference-steps 4 --output @/registered
+sweep_samplers --num-scenes 24 --samplers dpm++ --num-inference-steps 4
+sweep_seams --input @/town --max-scenes 1 --settings 4 1 1 1 0
+sweep_references --real @/datasets/town --generated @/town --reference-sizes 8 --min-distances-m 1 --k 3
+ablate_lvae encoding --train-sizes 64 --any-footprint-train-sizes 64 --yaw-only-train-sizes 64 --num-seeds 1 --epochs 1
+run_demo --preset smoke --output @/demo
+serve_studio --datasets @/town --port 8600
+"""
+
+
+@dataclass(frozen=True)
+class Config:
+    diffusion: str = ""
+    """Local directory of Stable Diffusion for paint_streets."""
+    controlnet: str = ""
+    """Local directory of a ControlNet for paint_streets."""
+    jobs: tuple[str, ...] = ()
+    """Names of the jobs to submit, such as sample_scenes (default: all)."""
+    output: Path | None = None
+    """File to write the transcript to (default: standard output only)."""
+
+
+def submit(cluster: Cluster, settings: Path, words: list[str], *options: str) -> subprocess.CompletedProcess[str]:
+    """Submit a job, and wait for its end unless an option says otherwise."""
+    address = f"http://127.0.0.1:{cluster.dashboard_port}"
+    command = [RAY, "job", "submit", "--address", address, "--runtime-env", str(settings), *options, "--", *words]
+    end = time.monotonic() + 120
+    while True:
+        found = subprocess.run(command, cwd=ROOT, env=cluster.environment, capture_output=True, text=True, check=False)
+        if "No available agent" not in found.stderr or time.monotonic() > end:  # The head has just started.
+            return found
+        time.sleep(2)
+
+
+def show(words: list[str], output: str, seconds: float) -> str:
+    """Return a command and the last lines of its output, without Ray's own lines and without bars of progress."""
+    ours = [
+        line
+        for line in re.sub(r"\x1b\[[0-9;]*m", "", output).splitlines()
+        if line.strip()
+        and not re.match(
+            r"\(|\d{4}-\d\d-\d\d |[-=]{5}|Job |Next steps|Query|Ask|Tailing|Running entrypoint|🧪|🏃|.*\d+%\|", line
+        )
+    ]
+    command = "ray job submit --runtime-env env.yaml -- " + " ".join(words)
+    return "\n".join([f"$ {command}", *(line[:160] for line in ours[-SHOWN:]), f"# {seconds:.0f} s", ""])
+
+
+def serve(cluster: Cluster, settings: Path, words: list[str]) -> str:
+    """Submit the studio, request its page, and stop the job."""
+    started = time.monotonic()
+    found = submit(cluster, settings, words, "--no-wait", "--submission-id", "studio")
+    if found.returncode:
+        raise RuntimeError(found.stdout + found.stderr)
+    address = f"http://127.0.0.1:{cluster.dashboard_port}"
+    text, end = "", time.monotonic() + 120
+    while "http://127.0.0.1:8600" not in text:
+        if time.monotonic() > end:
+            raise RuntimeError(text)
+        time.sleep(1)
+        command = [RAY, "job", "logs", "--address", address, "studio"]
+        text = subprocess.run(command, env=cluster.environment, capture_output=True, text=True, check=False).stdout
+    with urllib.request.urlopen("http://127.0.0.1:8600/", timeout=30) as page:
+        text += f"\n# GET http://127.0.0.1:8600/: status {page.status}"
+    subprocess.run([RAY, "job", "stop", "--address", address, "studio"], env=cluster.environment, check=True)
+    return show(words, text, time.monotonic() - started)
+
+
+def run_jobs(config: Config, folder: Path, failed: list[str]) -> Iterator[str]:
+    """Submit all jobs; yield the transcript of each, and add the names of jobs that fail to a list."""
+    with open_store("s3", folder / "s3", 2, dashboard=True) as store:
+        cluster = store.cluster
+        kept = ("AWS_", "PRITTI_", "MLFLOW_", "OMP_", "DO_NOT", "RAY_TRAIN", "RAY_worker")
+        variables = {name: value for name, value in cluster.environment.items() if name.startswith(kept)}
+        variables |= {"PRITTI_HOME": HOME, "AWS_ENDPOINT_URL": variables["MLFLOW_S3_ENDPOINT_URL"]}
+        settings = folder / "env.yaml"
+        runtime = yaml.safe_load((ROOT / "infra/runtime_env.yaml").read_text())
+        runtime |= {"env_vars": runtime["env_vars"] | variables, "working_dir": str(ROOT)}
+        runtime["excludes"] += ["build", "docs"]
+        settings.write_text(yaml.safe_dump(runtime))
+        settings.chmod(0o600)
+        for line in JOBS.strip().splitlines():
+            job, *words = line.split()
+            if config.jobs and job not in config.jobs:
+                continue
+            if job == "paint_streets" and not (config.diffusion and config.controlnet):
+                yield "# paint_streets: left out, because --diffusion and --controlnet are missing\n"
+                continue
+            models = {"DIFFUSION": config.diffusion, "CONTROLNET": config.controlnet}
+            shown = [f"jobs/{job}.py", *(word.replace("@", "$PRITTI_HOME") for word in words)]
+            words = [f"jobs/{job}.py", *(models.get(word, word.replace("@", HOME)) for word in words)]
+            if job == "serve_studio":
+                yield serve(cluster, settings, words).replace(HOME, "$PRITTI_HOME")
+                continue
+            started = time.monotonic()
+            done = submit(cluster, settings, words)
+            if done.returncode:
+                failed.append(job)
+                print(f"error: {' '.join(words)}\n{done.stdout[-4000:]}{done.stderr[-2000:]}", file=sys.stderr)
+                continue
+            yield show(shown, done.stdout, time.monotonic() - started).replace(HOME, "$PRITTI_HOME")
+
+
+def main(config: Config) -> int:
+    parts = [f"# {describe_machine()}\n"]
+    print(parts[0], flush=True)
+    failed: list[str] = []
+    with tempfile.TemporaryDirectory(prefix="jobs-") as folder:
+        for part in run_jobs(config, Path(folder), failed):
+            print(part, flush=True)
+            parts.append(part)
+    if config.output:
+        config.output.write_text("\n".join(parts))
+    print(f"{len(failed)} jobs failed{': ' * bool(failed)}{', '.join(failed)}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("RAY_AUTH_MODE", "disabled")
+    sys.exit(main(tyro.cli(Config, description=__doc__)))
