@@ -5,7 +5,8 @@
 Each stage runs twice on an S3 server of this machine (moto), with few and with many units. A rate is the difference of
 both runs, divided by the difference of the units, so it excludes the start of Ray and Python. CPU time is the sum over
 all processes of the cluster and of the driver, not of the servers. The dense towns in KITTI-360's format have the
-density of real drives. All other stages use the built-in town and its released weights.
+density of real drives. All other stages use the built-in town. `encode` uses an
+untrained layout VAE with the size of the released one, `sample` and `outpaint` use the released weights.
 """
 
 from __future__ import annotations
@@ -33,7 +34,6 @@ from models.uris import join_uri, resolve_uri
 ROOT = Path(__file__).parents[1]
 RATES = Path(__file__).with_name("cost_rates.json")
 WRITES = ("PUT", "POST")
-MODELS = "models/weights/town"
 TOWNS = {"few": (256, 64), "many": (768, 256)}  # Numbers of training and test scenes.
 BLOCKS = {"few": 8, "many": 24}  # Blocks around a scene, one and two on each side.
 
@@ -165,7 +165,9 @@ def measure_rates(stages: Stages, raw: Path) -> dict[str, dict[str, float]]:
     for size, (train, test) in TOWNS.items():
         town = where(f"town-{size}")
         stages.run("preprocess_scenes", "town", "--num-train", str(train), "--num-test", str(test), "--output", town)
-        words = ("--dataset", town, "--lvae", str(ROOT / MODELS / "lvae"))
+        lvae = where(f"lvae-{size}")
+        stages.run("train_lvae", "town", "--dataset", town, "--steps", "4", "--name", f"lvae-{size}", "--output", lvae)
+        words = ("--dataset", town, "--lvae", lvae)
         usage = stages.measure(train + test, f"latents-{size}", "encode_latents", *words)
         found.setdefault("encode", {})[size] = usage
         words = ("--model", "town", "--num-scenes", str(test), "--sampler", "dpm++", "--num-inference-steps", "20")

@@ -37,9 +37,9 @@ train_lvae smoke --dataset @/datasets/town --name small-lvae --steps 24
 encode_latents --dataset @/datasets/town --lvae @/models/small-lvae
 train_dit smoke --dataset @/datasets/town --name small --steps 24 --num-workers 2
 sample_scenes --model @/models/pritti-small --num-scenes 24 --num-inference-steps 4 --existence-threshold 0.01
-sample_scenes --num-scenes 24 --sampler dpm++ --num-inference-steps 10 --run town --output @/town
-outpaint_scenes --input @/town --guided --num-inference-steps 5
-inpaint_scenes --input @/town --half-plane 1 0 32 --guided --num-inference-steps 5 --output @/inpainted
+sample_scenes --model town --num-scenes 24 --sampler dpm++ --num-inference-steps 10 --run town --output @/town
+outpaint_scenes --model town --input @/town --guided --num-inference-steps 20
+inpaint_scenes --model town --input @/town --half-plane 1 0 32 --guided --num-inference-steps 20 --output @/inpainted
 edit_scenes remove --category pole --input @/town --output @/edited
 evaluate_scenes --real @/datasets/town --generated @/town --run town --lvae @/models/small-lvae --lite0 False
 evaluate_seams --generated @/outpainted
@@ -51,8 +51,8 @@ paint_streets --streets @/town/streets/drive --diffusion DIFFUSION --controlnet 
 inspect_scenes report --dataset @/town --num-examples 2
 publish_model --name small --model @/models/pritti-small --evaluation @/evaluations/town --output @/zoo
 sample_scenes --model models:/small/1 --num-scenes 4 --num-inference-steps 4 --output @/registered
-sweep_samplers --num-scenes 24 --samplers dpm++ --num-inference-steps 4
-sweep_seams --input @/town --max-scenes 1 --settings 4 1 1 1 0
+sweep_samplers --model town --num-scenes 24 --samplers dpm++ --num-inference-steps 4
+sweep_seams --model town --input @/town --max-scenes 1 --settings 4 1 1 1 0
 sweep_references --real @/datasets/town --generated @/town --reference-sizes 8 --min-distances-m 1 --k 3
 ablate_lvae encoding --train-sizes 64 --any-footprint-train-sizes 64 --yaw-only-train-sizes 64 --num-seeds 1 --epochs 1
 run_demo --preset smoke --output @/demo
