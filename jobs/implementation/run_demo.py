@@ -23,6 +23,7 @@ from jobs.support.cli import home_path, make_absolute
 from jobs.support.ray_session import start_ray
 from jobs.train_dit import Config as DiTConfig
 from jobs.train_lvae import Config as LVAEConfig
+from models.uris import is_uri
 from pipelines.rendering.render import arrange_contact_sheet, encode_png, render_3d
 from pipelines.runtime import storage
 from pipelines.schema.tables import read_scenes
@@ -67,12 +68,18 @@ def show_released(config: Config) -> None:
     sheet = arrange_contact_sheet([render_3d(scene, 480, 360) for scene in scenes], columns=4)
     path = home_path("released.png")
     storage.write_whole(path, lambda stream: stream.write(encode_png(sheet)))
-    print(f"pictures: {os.path.relpath(path)}; the next stages train a model of this kind")
+    print(f"pictures: {shorten_path(path)}; the next stages train a model of this kind")
+
+
+def shorten_path(path: str) -> str:
+    """Return a local path relative to the working directory, or a URI as it is."""
+    return path if is_uri(path) else os.path.relpath(path)
 
 
 def main(config: Config) -> None:
     os.environ["PRITTI_HOME"] = make_absolute(config.output)
-    os.environ.pop("MLFLOW_TRACKING_URI", None)  # the demo writes all files under the output directory
+    if not is_uri(config.output):  # The demo writes all files under the output directory.
+        os.environ.pop("MLFLOW_TRACKING_URI", None)
     stages = Stages(home_path("stages.json"), total=9 if config.num_released_scenes else 8)
     start_ray(training=True)
     if config.num_released_scenes:
@@ -81,7 +88,7 @@ def main(config: Config) -> None:
     scores = run_generation_stages(config, stages)
     report = home_path("report.html")
     stages.run("write the report", lambda: write_demo_report(report, config, scores, stages.seconds))
-    print(f"\nreport: {os.path.relpath(report)}")
+    print(f"\nreport: {shorten_path(report)}")
 
 
 def run_training_stages(config: Config, stages: Stages) -> None:
