@@ -144,7 +144,7 @@ class Store:
     def digest(self, run: str) -> dict[str, str]:
         """Return a digest of each table, file of scores and file of weights of a run, by relative path."""
         file_system, path = resolve_uri(join_uri(self.home, "results", run))
-        found = file_system.get_file_info(pafs.FileSelector(path, recursive=True))
+        found = file_system.get_file_info(pafs.FileSelector(path, recursive=True, allow_not_found=True))
         names = {info.path[len(path) + 1 :]: info.path for info in found if info.is_file}
         names = {name: place for name, place in names.items() if not name.startswith(".") and "/." not in name}
         return {

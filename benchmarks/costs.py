@@ -32,7 +32,7 @@ from models.vae.losses import compute_lvae_loss
 KITTI360_SCENES = 61_913 + 1_233  # Paper, Sec. 4.1.
 SWEEPS_PER_LOG = 156.5  # Argoverse 2: 313 sweeps in two logs (docs/experiments/preprocessing_and_geometry.md).
 BLOCK_STEP_M = 32.0  # A block of 64 m x 64 m overlaps its neighbours by half.
-BYTES_PER_WEIGHT = 16  # A checkpoint has weights, EMA and two moments of AdamW in float32.
+BYTES_PER_WEIGHT = 20  # A checkpoint has weights, EMA, two moments of AdamW, and the model, in float32.
 CHECKPOINTS = 2  # Number of checkpoints that a run keeps.
 PAPER_GPU_HOURS = {"train LVAE": 72, "train DiT": 288}  # Supplement B.2, B.3: 3 days on one and on four A100.
 
@@ -180,12 +180,17 @@ def estimate(config: Config, work: Work, rates: dict[str, dict[str, float]]) -> 
     yield measured(project, "outpaint", blocks, "blocks, RePaint", hours(blocks * block))
 
 
+def find_paper_hours(row: Row) -> int:
+    """Return the GPU hours of the paper for a stage, or 0; the paper states only those of KITTI-360."""
+    return PAPER_GPU_HOURS.get(row.stage, 0) if row.project == "KITTI-360" else 0
+
+
 def format_table(rows: list[Row], config: Config) -> str:
     """Return the rows as a Markdown table."""
     lines = ["| project | stage | units | GPU h | CPU h | writes | reads | stored GB | price |"]
     lines.append("|---" * 9 + "|")
     for row in rows:
-        gpu = f"{row.gpu_hours:,.2f}" + (f" (paper: {p})" if (p := PAPER_GPU_HOURS.get(row.stage)) else "")
+        gpu = f"{row.gpu_hours:,.2f}" + (f" (paper: {p})" if (p := find_paper_hours(row)) else "")
         lines.append(
             f"| {row.project} | {row.stage} | {row.units} | {gpu if row.gpu_hours else '0'} | {row.cpu_hours:,.1f} |"
             f" {row.writes:,.0f} | {row.reads:,.0f} | {row.gigabytes:,.2f} | {row.price(config):,.2f} |"

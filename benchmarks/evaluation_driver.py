@@ -86,7 +86,7 @@ def main(config: Config) -> None:
             while not done.wait(0.1):
                 peak = max(peak, measure_private_bytes())
 
-        watcher = threading.Thread(target=watch)
+        watcher = threading.Thread(target=watch, daemon=True)
         watcher.start()
         started, cpu = time.perf_counter(), time.process_time()
         scores = compare_datasets(sides["real"], sides["generated"], dataset.spec.ground_classes)

@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
 # Options of an s3:// URI. The names are those of pyarrow.fs.S3FileSystem.
-S3_OPTIONS = ("endpoint_override", "region", "scheme", "anonymous", "role_arn", "tls_ca_file_path")
+S3_OPTIONS = ("endpoint_override", "region", "scheme", "anonymous", "tls_ca_file_path")
 OBJECT_STORES = ("s3", "gcs", "abfs")  # File systems of pyarrow whose writes replace a whole object in one request.
 _BROKEN = re.compile(r"(^|/)(s3|gs|gcs|abfss?|https?):(/(?!/)|$)")  # a URI that lost a slash
 

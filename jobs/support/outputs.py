@@ -24,6 +24,7 @@ from pipelines.schema.lease import LIFETIME_S, IfBusy, Lease, Owner
 logger = logging.getLogger(__name__)
 
 NODES_S = 5.0  # Time between two searches for new nodes.
+NODE_ATTEMPTS = 3  # Number of failed checks of new nodes after which the job stops.
 LIFETIME_VARIABLE = "PRITTI_LEASE_SECONDS"  # Time after which the lease of a silent job expires.
 JOB_VARIABLE = "RAY_JOB_CONFIG_JSON_ENV_VAR"  # Ray sets this variable in submitted jobs.
 
@@ -125,14 +126,15 @@ def watch_new_nodes(output: str, checked: set[str]) -> Iterator[None]:
     done = threading.Event()
 
     def watch() -> None:
-        known = checked
+        known, failures = checked, 0
         while not done.wait(NODES_S):
             try:
-                known = known | require_shared_storage(output, known)
+                known, failures = known | require_shared_storage(output, known), 0
             except ValueError as error:
-                if not done.is_set():
+                failures += 1  # The storage of a node that has just started may need a moment.
+                if failures == NODE_ATTEMPTS and not done.is_set():
                     _stop_job(str(error))
-                return
+                    return
             except Exception as error:  # The cluster or the storage does not answer; the job itself will notice.
                 logger.debug("new nodes were not checked: %s", error)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import dataclass
 
@@ -79,6 +80,19 @@ def count_retries() -> int:
     return restarts + sum(event.attempt_number > 0 for event in _read_task_events())
 
 
+def shorten_actor_name(name: str) -> str:
+    """Return the name of the class of an actor.
+
+    Args:
+        name: Name of the actor's first task, such as "MapWorker(Map(Sampler)).__init__" or "Outpainter.__init__".
+
+    Returns:
+        Name such as "Sampler".
+    """
+    inside = re.sub(r"^MapWorker\((?:Map\w*\()?", "", name)
+    return re.split(r"[).]", inside, maxsplit=1)[0]
+
+
 def list_waiting() -> list[str]:
     """Describe what this driver's actors and training workers wait for.
 
@@ -91,7 +105,7 @@ def list_waiting() -> list[str]:
     names: dict[str, int] = {}
     for event in _read_task_events():
         if event.task_info.type == 1 and not ({TaskStatus.RUNNING, *ENDED} & set(event.state_updates.state_ts_ns)):
-            name = event.task_info.name.removesuffix(".__init__").removeprefix("MapWorker(").rstrip(")")
+            name = shorten_actor_name(event.task_info.name)
             names[name] = names.get(name, 0) + 1
     pending = sum(
         actor["JobID"] == job and actor["State"] == "PENDING_CREATION" for actor in state.actor_table(None).values()

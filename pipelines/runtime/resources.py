@@ -32,7 +32,9 @@ class ResourcePolicy:
     wait_s: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.gpus is not None and (self.gpus < 0 or (self.gpus > 1 and not float(self.gpus).is_integer())):
+        if self.gpus is not None and (
+            not 0 <= self.gpus < math.inf or (self.gpus > 1 and not float(self.gpus).is_integer())
+        ):
             raise ValueError(f"--gpus is {self.gpus}, expected a whole number, or a share of a GPU from 0 to 1")
         if not 0 <= self.wait_s < math.inf:
             raise ValueError(f"--wait-for-resources is {self.wait_s}, expected a number of seconds of at least 0")

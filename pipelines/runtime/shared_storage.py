@@ -43,7 +43,7 @@ def require_shared_storage(output: str, checked: Collection[str] = ()) -> set[st
     }
     try:
         for node, task in tasks.items():
-            _require_marker(output, markers[node], token, _find_node_name(nodes[node]), task)
+            _require_marker(output, markers[node], token, nodes[node], task)
     finally:
         # The tasks are not cancelled: if a task ends in the same moment, `ray.cancel` ends the driver (Ray 2.60).
         for marker in markers.values():
@@ -61,8 +61,9 @@ def write_marker(marker: str, token: str) -> str:
     return provenance.digest_code()
 
 
-def _require_marker(output: str, marker: str, token: str, name: str, task: Any) -> None:
+def _require_marker(output: str, marker: str, token: str, node: dict[str, Any], task: Any) -> None:
     """Raise ValueError if the marker of a node is not there or the node runs other code."""
+    name = _find_node_name(node)
     try:
         digest = ray.get(task, timeout=NODE_TIMEOUT_S)
     except GetTimeoutError as error:
@@ -78,8 +79,10 @@ def _require_marker(output: str, marker: str, token: str, name: str, task: Any) 
             f"{name} cannot run this package ({cause or error}); install the same version on all nodes, or submit the"
             " job with --runtime-env infra/runtime_env.yaml"
         ) from error
-    except RayError:  # The node left the cluster; no task will run there.
-        return
+    except RayError as error:
+        if any(other["NodeID"] == node["NodeID"] and other["Alive"] for other in ray.nodes()):
+            raise ValueError(f"{name} cannot run tasks ({error}); see its logs, or remove the node") from error
+        return  # The node left the cluster; no task will run there.
     if not storage.exists(marker) or storage.read_bytes(marker) != token.encode():
         raise ValueError(
             f"{name} does not share {output} with the driver: a file that it wrote there is not visible here; use a"

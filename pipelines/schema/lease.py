@@ -85,6 +85,7 @@ class Lease:
         self.lifetime_s = lifetime_s
         self.directory = storage.join_uri(output, LEASES, make_file_name(name))
         self.number = 0
+        self.token = secrets.token_hex(8)
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -132,9 +133,17 @@ class Lease:
 
     def _create(self, number: int) -> bool:
         """Create a record exclusively; return whether it is the newest."""
-        if not storage.create_file(self._path(number), self._encode("running")):
+        created = storage.create_file(self._path(number), self._encode("running"))
+        if not created and not self._is_own(number):
             return False
         return max(self._list_numbers(), default=number) == number
+
+    def _is_own(self, number: int) -> bool:
+        """Return whether a record is ours: a request whose first answer was lost is repeated, and then refused."""
+        try:
+            return storage.read_json(self._path(number)).get("token") == self.token
+        except (ValueError, AttributeError):
+            return False
 
     def _delete_old_records(self) -> None:
         for number in self._list_numbers():
@@ -150,7 +159,7 @@ class Lease:
                 if message := self._beat():
                     self.on_lost(message)
                     return
-            except OSError:  # The next heartbeat may succeed; otherwise, the record expires.
+            except Exception:  # The next heartbeat may succeed; otherwise, the record expires.
                 continue
 
     def _beat(self) -> str:
@@ -183,7 +192,7 @@ class Lease:
         return storage.join_uri(self.directory, f"{number:08d}.json")
 
     def _encode(self, state: str) -> bytes:
-        record = asdict(self.owner) | {"state": state, "lifetime_s": self.lifetime_s}
+        record = asdict(self.owner) | {"state": state, "lifetime_s": self.lifetime_s, "token": self.token}
         return json.dumps(record).encode()
 
     def _list_numbers(self) -> list[int]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.runtime import machines
+from pipelines.runtime import machines, storage
 from pipelines.schema.lease import Lease, LeaseError, Owner
 
 ELSEWHERE = {"machine": "0" * 12, "host": "other"}
@@ -134,3 +134,14 @@ def test_sigterm_stops_the_job_and_ends_its_lease_as_killed(tmp_path):
     joined = make_lease(tmp_path, "job-2")
     joined.acquire("join")  # An ended job is not waited for.
     joined.release("finished")
+
+
+def test_repeated_request_of_the_same_writer_is_no_conflict(tmp_path, monkeypatch):
+    """Object storage stored the record, but its answer was lost: the client repeats the request, which is refused."""
+    create = storage.create_file
+    monkeypatch.setattr(storage, "create_file", lambda *arguments: create(*arguments) and create(*arguments))
+    lease = make_lease(tmp_path, "job-1")
+    lease.acquire()
+    with pytest.raises(LeaseError, match="job job-1"):
+        make_lease(tmp_path, "job-2").acquire()
+    lease.release("finished")

@@ -86,3 +86,12 @@ def test_json_lines_hold_every_printed_line(monkeypatch):
     (error,) = map(json.loads, errors.getvalue().splitlines())
     assert error["level"] == "error" and error["message"] == "error: no such file"
     assert sys.stdout is out and not isinstance(sys.stdout, JsonLines)
+
+
+@pytest.mark.parametrize(
+    "name", ["MapWorker(Map(Sampler)).__init__", "MapWorker(MapBatches(Sampler)).__init__", "Sampler.__init__"]
+)
+def test_names_of_actors_are_short(name):
+    from pipelines.runtime.cluster_state import shorten_actor_name
+
+    assert shorten_actor_name(name) == "Sampler"
