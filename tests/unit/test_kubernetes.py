@@ -342,6 +342,8 @@ def check_entrypoint(document: dict) -> Iterator[Problem]:
     if any(group.get("groupName") == "gpu" for group in groups) and gpus < getattr(options, "num_workers", 1):
         message = f"--num-workers is {getattr(options, 'num_workers', 1)}, but {replicas} give {gpus} GPUs"
         yield ("spec", "entrypoint"), message
+    if options.if_busy != "wait":
+        yield ("spec", "entrypoint"), "without --if-busy wait, the lease of a lost head refuses the repeated job"
     if gpus and not getattr(options, "gpus", None):
         yield ("spec", "entrypoint"), "without --gpus, the job runs on CPUs if no GPU node runs when it starts"
     if job in ("train_lvae", "train_dit"):
@@ -580,6 +582,7 @@ PLANTED = {
         "spec.entrypoint",
         "jobs/train_dit.py kitti360 --num-workers 16 --gpus 1 --wait-for-resources 900",
     ),
+    "lease of a lost head": ("RayJob", "preprocess", "spec.entrypoint", "jobs/preprocess_scenes.py town"),
     "no wait for GPUs": ("RayJob", "train-dit", "spec.entrypoint", "jobs/train_dit.py kitti360 --gpus 1"),
     "fall-back to CPUs": (
         "RayJob",
