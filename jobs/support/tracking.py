@@ -138,7 +138,8 @@ class Tracker:
         api = make_client(uri)
         if (found := api.get_experiment_by_name(experiment)) is not None:
             close_dead_runs(api, found.experiment_id)
-        if record and storage.exists(record) and (known := storage.read_json(record))["tracking_uri"] == uri:
+        known = storage.read_json(record) if record and storage.exists(record) else {"tracking_uri": ""}
+        if hide_credentials(known["tracking_uri"]) == hide_credentials(uri):
             api.update_run(known["run_id"], status="RUNNING")
             api.set_tag(known["run_id"], OWNER, json.dumps(describe_owner()))
             return cls(uri, known["run_id"])
@@ -160,7 +161,7 @@ class Tracker:
         for key, value in tags.items():
             api.set_tag(run_id, key, value)
         if record:
-            storage.write_json({"tracking_uri": uri, "run_id": run_id}, record)
+            storage.write_json({"tracking_uri": hide_credentials(uri), "run_id": run_id}, record)
         return cls(uri, run_id)
 
     def metrics(self, values: dict[str, float], step: int) -> None:

@@ -226,6 +226,11 @@ def fit(run: TrainingRun, num_workers: int, output: str, min_workers: int = 0) -
         with JobProgress() as bar:
             bar.follow(run.name, run.settings.steps, partial(read_step, run))
             result = fit_with_retries(run, scaling)
+        if result.checkpoint is None:
+            raise ValueError(f"run {run.name!r} ended without a checkpoint; increase --steps")
+        with result.checkpoint.as_directory() as directory:
+            publish_directory(os.path.join(directory, "model"), output)
+            run.tracker.artifacts(os.path.join(directory, "model"), "model")
     except KeyboardInterrupt:
         run.tracker.finish("KILLED")
         raise
@@ -235,11 +240,6 @@ def fit(run: TrainingRun, num_workers: int, output: str, min_workers: int = 0) -
             if isinstance(find_root_cause(failure), ValueError):
                 raise find_root_cause(failure) from error
         raise
-    if result.checkpoint is None:
-        raise ValueError(f"run {run.name!r} ended without a checkpoint; increase --steps")
-    with result.checkpoint.as_directory() as directory:
-        publish_directory(os.path.join(directory, "model"), output)
-        run.tracker.artifacts(os.path.join(directory, "model"), "model")
     run.tracker.finish("FINISHED")
     return output
 
