@@ -8,7 +8,7 @@ The runner starts a cluster of raylets on this machine. With the store s3 (an S3
 disks of another. Each stage first runs undisturbed. Each further run of a stage has its own output. At a random moment
 of the stage's duration, the runner kills a random worker, a random raylet or the driver with SIGKILL. A new raylet
 replaces a killed one. A stage whose driver was killed, or which fails because its nodes died, runs again with the same
-command. Every run must then have the tables, scores and weights of the undisturbed run: no scene lost, none doubled.
+command. Every run must then have the tables, scores and weights of the undisturbed run: no scene is lost or duplicated.
 The runner prints one line per run and ends with exit code 1 if a run differs.
 """
 

@@ -21,7 +21,7 @@ Resources = Mapping[str, float]
 
 @dataclass(frozen=True)
 class ResourcePolicy:
-    """Wishes of the user for all graphs of a driver.
+    """Resource options for all graphs of a driver.
 
     Attributes:
         gpus: Number of GPUs per model. None: 1 if the cluster has a GPU, otherwise 0.
@@ -48,7 +48,7 @@ def set_resource_policy(policy: ResourcePolicy) -> Iterator[None]:
     """Use a policy for all graphs that this driver runs in the body.
 
     Args:
-        policy: Wishes of the user.
+        policy: Resource options.
 
     Yields:
         None.
