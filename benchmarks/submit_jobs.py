@@ -46,7 +46,7 @@ evaluate_seams --generated @/outpainted
 export_scenes --input @/town --max-scenes 4 --formats glb npz --output @/exports
 import_scenes @/exports/glb --name theirs --output @/imported
 evaluate_voxels --ground-truth @/exports/npz --reconstructed @/exports/npz --output @/voxels
-render_streets --input @/town --max-scenes 2 --spacing-m 16 --output @/town
+render_streets --input @/town --max-scenes 2 --spacing-m 16 --width-px 176 --height-px 48 --output @/town
 paint_streets --streets @/town/streets/drive --diffusion DIFFUSION --controlnet CONTROLNET --num-inference-steps 2
 inspect_scenes report --dataset @/town --num-examples 2
 publish_model --name small --model @/models/pritti-small --evaluation @/evaluations/town --output @/zoo
