@@ -89,7 +89,8 @@ class Config:
     seed: int = 0
     """Seed of the moments and victims."""
     first: int = 0
-    """Number of the first run; run k of a seed has always the same stage, store, victim and share of the duration."""
+    """Number of the first run; run k of a seed has always the same stage, store, share of the duration and, without
+    --victims, the same victim."""
     log: str = ""
     """File to which one JSON object per run is appended (default: none)."""
 

@@ -12,6 +12,7 @@ No GPU was measured. Prices are options. The prices by default are rounded list 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -198,7 +199,10 @@ def format_table(rows: list[Row], config: Config) -> str:
     return "\n".join(lines)
 
 
-def main(config: Config) -> None:
+def main(config: Config) -> int:
+    if not RATES.exists():
+        print(f"error: {RATES} does not exist; run python benchmarks/cost_rates.py first", file=sys.stderr)
+        return 2
     record, work = json.loads(RATES.read_text()), count_work()
     print(f"rates: {record['command']}; {record['machine']}")
     values = (work.lvae_step, work.encode, work.decode, work.dit_step, work.denoise)
@@ -207,7 +211,8 @@ def main(config: Config) -> None:
     rows = list(estimate(config, work, record["per_unit"]))
     print(format_table(rows, config))
     print(f"total: {sum(row.price(config) for row in rows):,.0f}")
+    return 0
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    sys.exit(main(tyro.cli(Config, description=__doc__)))

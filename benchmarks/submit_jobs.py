@@ -6,7 +6,7 @@
 
 The S3 server (moto), MLflow and the cluster run on this machine, each node in a mount namespace. Ray uploads the code.
 The script prints each command, the last lines of its output and its duration as Markdown, and ends with exit code 1 if
-a job fails. docs/how_to/cluster.md contains such a transcript.
+a job fails.
 """
 
 from __future__ import annotations

@@ -206,8 +206,10 @@ class Lease:
             return 0, {}
         try:
             record = storage.read_json(self._path(number))
-        except ValueError:  # Its owner is creating it, or a successor has deleted it.
-            record = {}
+        except ValueError:
+            if max(self._list_numbers(), default=0) != number:  # A successor has deleted it.
+                return self._read_newest()
+            record = {}  # Its owner is creating it.
         return number, record if isinstance(record, dict) else {}
 
     def _has_expired(self, number: int, record: dict[str, Any]) -> bool:

@@ -145,3 +145,21 @@ def test_repeated_request_of_the_same_writer_is_no_conflict(tmp_path, monkeypatc
     with pytest.raises(LeaseError, match="job job-1"):
         make_lease(tmp_path, "job-2").acquire()
     lease.release("finished")
+
+
+def test_record_that_a_successor_deletes_is_read_again(tmp_path, monkeypatch):
+    first = make_lease(tmp_path, "job-1")
+    first.acquire()
+    first.release("killed")
+    read, successor = storage.read_json, make_lease(tmp_path, "job-2")
+
+    def read_late(path: str):
+        monkeypatch.setattr(storage, "read_json", read)
+        successor.acquire()  # deletes the record of the first job
+        return read(path)
+
+    reader = make_lease(tmp_path, "job-3")
+    monkeypatch.setattr(storage, "read_json", read_late)
+    number, record = reader._read_newest()
+    assert (number, record["job"]) == (2, "job-2")
+    successor.release("finished")
