@@ -295,6 +295,9 @@ def open_store(kind: str, folder: Path, num_raylets: int, has_mlflow: bool = Tru
 
 def main(config: Config) -> int:
     """Run the stages; return the exit code."""
+    if config.raylets < 2 and config.victims == ("raylet",):
+        print("error: the head is never killed, so --victims raylet needs --raylets 2 or more", file=sys.stderr)
+        return 2
     if "s3" in config.stores and not are_namespaces_allowed():
         print("error: mount namespaces are forbidden here (unshare -rm); use --stores disk", file=sys.stderr)
         return 2

@@ -29,6 +29,7 @@ from common import describe_machine
 from raylets import RAY, ROOT, Cluster
 
 HOME = "s3://tests/home"
+JOB_TIMEOUT_S = 900
 SHOWN = 2  # Number of lines of each output.
 # @ is the home directory.
 JOBS = """
@@ -78,13 +79,24 @@ def submit(cluster: Cluster, settings: Path, words: list[str], *options: str) ->
     command = [RAY, "job", "submit", "--address", address, "--runtime-env", str(settings), *options, "--", *words]
     end = time.monotonic() + 120
     while True:
-        found = subprocess.run(command, cwd=ROOT, env=cluster.environment, capture_output=True, text=True, check=False)
+        found = subprocess.run(
+            command, cwd=ROOT, env=cluster.environment, capture_output=True, text=True, timeout=JOB_TIMEOUT_S
+        )
         if "No available agent" not in found.stderr or time.monotonic() > end:  # The head has just started.
             return found
         time.sleep(2)
 
 
-def show(words: list[str], output: str, seconds: float) -> str:
+def submit_and_wait(cluster: Cluster, settings: Path, words: list[str]) -> tuple[str, float]:
+    """Submit a job and wait for its end; return its output and its duration (s)."""
+    started = time.monotonic()
+    done = submit(cluster, settings, words)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(words)}\n{done.stdout[-4000:]}{done.stderr[-2000:]}")
+    return done.stdout, time.monotonic() - started
+
+
+def format_transcript(words: list[str], output: str, seconds: float) -> str:
     """Return a command and the last lines of its output, without Ray's own lines and without bars of progress."""
     ours = [
         line
@@ -98,8 +110,8 @@ def show(words: list[str], output: str, seconds: float) -> str:
     return "\n".join([f"$ {command}", *(line[:160] for line in ours[-SHOWN:]), f"# {seconds:.0f} s", ""])
 
 
-def serve(cluster: Cluster, settings: Path, words: list[str]) -> str:
-    """Submit the studio, request its page, and stop the job."""
+def submit_studio(cluster: Cluster, settings: Path, words: list[str]) -> tuple[str, float]:
+    """Submit the studio, request its page, and stop the job; return its output and the duration (s)."""
     started = time.monotonic()
     found = submit(cluster, settings, words, "--no-wait", "--submission-id", "studio")
     if found.returncode:
@@ -115,7 +127,7 @@ def serve(cluster: Cluster, settings: Path, words: list[str]) -> str:
     with urllib.request.urlopen("http://127.0.0.1:8600/", timeout=30) as page:
         text += f"\n# GET http://127.0.0.1:8600/: status {page.status}"
     subprocess.run([RAY, "job", "stop", "--address", address, "studio"], env=cluster.environment, check=True)
-    return show(words, text, time.monotonic() - started)
+    return text, time.monotonic() - started
 
 
 def run_jobs(config: Config, folder: Path, failed: list[str]) -> Iterator[str]:
@@ -141,19 +153,21 @@ def run_jobs(config: Config, folder: Path, failed: list[str]) -> Iterator[str]:
             models = {"DIFFUSION": config.diffusion, "CONTROLNET": config.controlnet}
             shown = [f"jobs/{job}.py", *(word.replace("@", "$PRITTI_HOME") for word in words)]
             words = [f"jobs/{job}.py", *(models.get(word, word.replace("@", HOME)) for word in words)]
-            if job == "serve_studio":
-                yield serve(cluster, settings, words).replace(HOME, "$PRITTI_HOME")
-                continue
-            started = time.monotonic()
-            done = submit(cluster, settings, words)
-            if done.returncode:
+            run = submit_studio if job == "serve_studio" else submit_and_wait
+            try:
+                output, seconds = run(cluster, settings, words)
+            except (RuntimeError, subprocess.TimeoutExpired) as error:
                 failed.append(job)
-                print(f"error: {' '.join(words)}\n{done.stdout[-4000:]}{done.stderr[-2000:]}", file=sys.stderr)
+                print(f"error: {error}", file=sys.stderr)
                 continue
-            yield show(shown, done.stdout, time.monotonic() - started).replace(HOME, "$PRITTI_HOME")
+            yield format_transcript(shown, output, seconds).replace(HOME, "$PRITTI_HOME")
 
 
 def main(config: Config) -> int:
+    known = {line.split()[0] for line in JOBS.strip().splitlines()}
+    if unknown := set(config.jobs) - known:
+        print(f"error: unknown job {min(unknown)}; expected some of {', '.join(sorted(known))}", file=sys.stderr)
+        return 2
     parts = [f"# {describe_machine()}\n"]
     print(parts[0], flush=True)
     failed: list[str] = []

@@ -66,8 +66,11 @@ def compare_encodings(config: Encoding) -> str:
     settings = StudyConfig(config.epochs, config.batch_size, config.learning_rate)
     trials = plan_trials(config)
     guard_study(output, asdict(settings) | {"test": config.num_test_boxes})
-    with hold_output(output, "ablation", config):
-        tracker = Tracker.start("pritti-ablation", "encoding", asdict(config), storage.join_uri(output, "mlflow.json"))
+    record = storage.join_uri(output, "mlflow.json")
+    with (
+        hold_output(output, "ablation", config),
+        Tracker.start("pritti-ablation", "encoding", asdict(config), record).end_on_error() as tracker,
+    ):
         with JobProgress() as bar:
             shown = bar.add_task("train autoencoders", total=len(trials))
             scores = ablation.reconstruct_boxes(
@@ -140,8 +143,11 @@ def compare_variants(config: Branches) -> str:
     find_preset(LVAE_PRESETS, config.preset)
     chosen = select_variants(config)
     guard_study(output, {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED})
-    with hold_output(output, "ablation", config):
-        tracker = Tracker.start("pritti-ablation", config.name, asdict(config), storage.join_uri(output, "mlflow.json"))
+    record = storage.join_uri(output, "mlflow.json")
+    with (
+        hold_output(output, "ablation", config),
+        Tracker.start("pritti-ablation", config.name, asdict(config), record).end_on_error() as tracker,
+    ):
         scores = []
         for seed in range(config.num_seeds):
             for variant in chosen:

@@ -7,6 +7,8 @@ import logging
 import os
 import re
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +165,19 @@ class Tracker:
         if record:
             storage.write_json({"tracking_uri": hide_credentials(uri), "run_id": run_id}, record)
         return cls(uri, run_id)
+
+    @contextmanager
+    def end_on_error(self) -> Iterator[Tracker]:
+        """Set the status of the run to KILLED or FAILED if the body does not end normally.
+
+        Yields:
+            This tracker.
+        """
+        try:
+            yield self
+        except BaseException as error:
+            self.finish("KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED")
+            raise
 
     def metrics(self, values: dict[str, float], step: int) -> None:
         """Log values by name for a training step."""

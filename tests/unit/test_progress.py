@@ -95,3 +95,14 @@ def test_names_of_actors_are_short(name):
     from pipelines.runtime.cluster_state import shorten_actor_name
 
     assert shorten_actor_name(name) == "Sampler"
+
+
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), "KILLED"), (OSError(), "FAILED")])
+def test_run_of_a_stopped_job_does_not_stay_running(monkeypatch, error, status):
+    from jobs.support.tracking import Tracker
+
+    ended: list[str] = []
+    monkeypatch.setattr(Tracker, "finish", lambda self, name: ended.append(name))
+    with pytest.raises(type(error)), Tracker("uri", "run").end_on_error():
+        raise error
+    assert ended == [status]
