@@ -26,6 +26,7 @@ WAITING_S = 30.0  # Time after which actors without room are announced; repeated
 STALL_S = 600.0
 STALL_VARIABLE = "PRITTI_STALL_SECONDS"
 POLL_S = 5.0
+COUNT_S = 30.0  # Time between two counts of retries, for which all task events of the cluster are read.
 EARLIER_S = 0.5  # Units that arrive in this time were finished by an earlier run.
 SHOWN_TASKS = 5
 
@@ -140,6 +141,7 @@ class JobProgress(Progress):
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._gauges: dict[str, Any] = {}
+        self._retries = 0
         self._followed: list[tuple[TaskID, Callable[[], float]]] = []
 
     def add_task(self, description: str, *arguments: Any, total: float | None = 100.0, **fields: Any) -> TaskID:
@@ -193,22 +195,24 @@ class JobProgress(Progress):
 
     def _report(self) -> None:
         printed = time.monotonic()
+        counted = -float("inf")
         while not self._stop.wait(POLL_S):
             if not ray.is_initialized() or not self.tracks:
                 continue
             with suppress(Exception):  # A report must not end the job; the cluster may be about to end.
                 for task, read in self._followed:
                     self.advance(task, max(0.0, read() - self.tracks[task].done))
+                if time.monotonic() - counted >= COUNT_S:
+                    counted, self._retries = time.monotonic(), count_retries()
                 current = [track for track in self.tracks.values() if not track.is_complete]
                 self._export(current)
                 for text, values in self._watch.look(max(track.advanced for track in self.tracks.values())):
                     self._print(text, values, always=True)
                 if time.monotonic() - printed >= LINE_S:
                     printed = time.monotonic()
-                    retries = count_retries()
                     for track in current[-1:]:
                         text, values = track.describe()
-                        self._print(f"{text}, {retries} retries", values | {"retries": retries})
+                        self._print(f"{text}, {self._retries} retries", values | {"retries": self._retries})
 
     def _print(self, text: str, values: dict[str, Any], always: bool = False) -> None:
         if always or not self.is_shown:
@@ -225,7 +229,7 @@ class JobProgress(Progress):
                 "rate_per_second": track.rate,
                 "last_progress_age_seconds": track.clock() - track.advanced,
                 "rejects": track.rejects,
-                "retries": count_retries(),
+                "retries": self._retries,
             }
             for name, value in values.items():
                 if name not in self._gauges:
