@@ -15,6 +15,7 @@ from test_faults import read_directory
 sys.path.insert(0, str(ROOT / "benchmarks"))
 from raylets import kill_family
 
+pytestmark = pytest.mark.slow  # tests/unit/test_lease.py tests the same rules without jobs.
 JOBS = {
     "preprocess": ("preprocess_scenes", "town", "--num-train", "64", "--num-test", "8"),
     "sample": ("sample_scenes", "--model", "town", "--num-scenes", "72", "--sampler", "dpm++")
@@ -42,7 +43,7 @@ def list_tables(output: Path) -> list[Path]:
     return sorted(path for path in output.rglob("*.parquet") if "/." not in str(path.relative_to(output)))
 
 
-@pytest.mark.parametrize("job", ["preprocess", pytest.param("sample", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("job", list(JOBS))
 def test_second_job_is_refused_or_waits_and_takes_over(tmp_path, job):
     output = tmp_path / "made"
     processes = [start(job, output)]
@@ -70,7 +71,6 @@ def test_second_job_is_refused_or_waits_and_takes_over(tmp_path, job):
     assert made == whole and len(made) >= 6
 
 
-@pytest.mark.slow
 def test_joined_job_waits_and_reports_the_same_result(tmp_path):
     output = tmp_path / "made"
     first = start("preprocess", output)
