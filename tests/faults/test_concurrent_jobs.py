@@ -54,10 +54,10 @@ def test_second_job_is_refused_or_waits_and_takes_over(tmp_path, job):
         processes += [start(job, output, "--if-busy", "refuse"), start(job, output, "--if-busy", "wait")]
         refused = processes[1].communicate(timeout=120)[0]
         assert processes[1].returncode == 2 and f"job {processes[0].pid} on " in refused, refused
+        assert f"waiting for job {processes[0].pid} on " in processes[2].stdout.readline()
         kill_family(processes[0])
         waiting = processes[2].communicate(timeout=200)[0]
         assert processes[2].returncode == 0, waiting
-        assert f"waiting for job {processes[0].pid} on " in waiting
     finally:
         for process in processes:
             kill_family(process)
