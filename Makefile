@@ -9,7 +9,7 @@
 #   make coverage    make test with line coverage, without lines in Ray's processes; half as long again
 PYTHON ?= python3
 BIN := .venv/bin
-# Two processes, one per core of CI: a third one only makes the others slower.
+# Two processes, one per core of CI.
 PYTEST := $(BIN)/python -m pytest -q -n 2
 
 # Quiet and quick Ray on small machines; no telemetry.

@@ -20,14 +20,13 @@ import torch
 import tyro
 from cost_rates import RATES
 from matching import make_town_batch
-from torch.nn.attention import SDPBackend, sdpa_kernel
-from torch.utils.flop_counter import FlopCounterMode
 
 from models.dit import DiT
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.presets import DIT_PRESETS, LVAE_PRESETS
 from models.sampling.repaint import NUM_INFERENCE_STEPS, repaint_transitions
+from models.training import count_flops
 from models.vae.losses import compute_lvae_loss
 
 KITTI360_SCENES = 61_913 + 1_233  # Paper, Sec. 4.1.
@@ -95,16 +94,6 @@ class Row:
         requests = self.writes * config.writes_1000 + self.reads * config.reads_1000
         hours = self.gpu_hours * config.gpu_hour + self.cpu_hours * config.cpu_hour
         return hours + requests / 1000 + self.gigabytes * config.gigabyte_month
-
-
-def count_flops(call) -> float:
-    """Return the number of floating-point operations of a call.
-
-    The counter of torch does not know the attention kernel of CPUs; it knows the matrix products of the kernel MATH.
-    """
-    with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
-        call()
-    return float(counter.get_total_flops())
 
 
 def count_work() -> Work:

@@ -21,6 +21,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils.flop_counter import FlopCounterMode
 
 from models.base import ConfiguredModel
 from models.batch import LayoutBatch
@@ -519,3 +521,18 @@ def make_dit_trainer(
 
 def _compile_model(model: nn.Module, execution: ExecutionConfig) -> nn.Module:
     return cast(nn.Module, torch.compile(model)) if execution.compile else model
+
+
+def count_flops(call: Callable[[], object]) -> float:
+    """Count the floating-point operations of a call.
+
+    Args:
+        call: Function without arguments that runs networks.
+
+    Returns:
+        Number of operations; a multiply-add counts as two. The counter of torch does not know the attention kernel of
+        CPUs, so attention runs as matrix products (MATH) meanwhile.
+    """
+    with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+        call()
+    return float(counter.get_total_flops())

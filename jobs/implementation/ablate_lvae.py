@@ -14,8 +14,6 @@ from statistics import median
 
 import pyarrow as pa
 import torch
-from torch.nn.attention import SDPBackend, sdpa_kernel
-from torch.utils.flop_counter import FlopCounterMode
 
 from jobs.ablate_lvae import Augmentation, Branches, Decoders, Encoding, Ground
 from jobs.implementation.train_lvae import prepare
@@ -31,6 +29,7 @@ from models.lvae import LayoutVAE
 from models.presets import LVAE_PRESETS, find_preset
 from models.studies.orientation_study import StudyConfig
 from models.tensors import make_layout_batch
+from models.training import count_flops
 from models.vae.config import override_options
 from pipelines.evaluation import ablation
 from pipelines.evaluation.ablation import Variant
@@ -242,10 +241,8 @@ def train_variant(config: Branches, variant: str, seed: int, output: str) -> dic
 
 def count_gflops(model: LayoutVAE, batch: LayoutBatch) -> float:
     """Return the number of floating-point operations that encode and decode a batch, divided by 1e9."""
-    # The counter does not know the attention kernel of CPUs; it knows the matrix products of the kernel MATH.
-    with torch.no_grad(), sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
-        model.decode(model.encode(batch).mean)
-    return counter.get_total_flops() / 1e9
+    with torch.no_grad():
+        return count_flops(lambda: model.decode(model.encode(batch).mean)) / 1e9
 
 
 def measure_steps(config: Branches, variant: str, output: str) -> int:

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 TAIL_BYTES = 2**17  # The end of a file is read first: the footer of a Parquet file, or the whole of a small file.
 HEAD_BYTES = 16
-GAP_BYTES = 2**17  # Ranges with a smaller gap are read by one request.
+GAP_BYTES = 2**17  # Ranges with at most this gap are read by one request.
 MAX_BYTES = 2**30  # Larger requests to `prefetch` are ignored: a damaged file may state any size.
 NUM_THREADS = 8
 
