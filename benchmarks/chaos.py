@@ -26,6 +26,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
@@ -293,6 +294,36 @@ def open_store(kind: str, folder: Path, num_raylets: int, has_mlflow: bool = Tru
         yield Store(kind, home, cluster)
 
 
+def run_kills(config: Config, get_store: Callable[[str], Store]) -> Counter[str]:
+    """Run stages with one kill each until there are enough kills.
+
+    Args:
+        config: Options of this script.
+        get_store: Function that returns the store of a kind.
+
+    Returns:
+        Number of kills by victim, of runs with another result, and of stages that failed because of a worker or raylet.
+    """
+    counts: Counter[str] = Counter()
+    for k in itertools.count(config.first):
+        if sum(counts[victim] for victim in VICTIMS) >= config.kills:
+            break
+        rng = random.Random(f"{config.seed} {k}")
+        store, stage = get_store(config.stores[k % len(config.stores)]), config.stages[k % len(config.stages)]
+        store.run_undisturbed(stage)
+        killed = sum(counts[name] for name in VICTIMS)
+        victim = config.victims[killed % len(config.victims)] if config.victims else rng.choice(VICTIMS)
+        record = disturb(store, stage, f"run-{k}", victim, rng)
+        counts[record["killed"].split()[0].rstrip(":")] += 1
+        counts["different"] += bool(record["faults"])
+        counts["repeated"] += bool(record["repeated"])
+        print(" ".join(f"{name}={value}" for name, value in record.items() if name != "log" and value), flush=True)
+        if config.log:
+            with open(config.log, "a") as stream:
+                stream.write(json.dumps(record) + "\n")
+    return counts
+
+
 def main(config: Config) -> int:
     """Run the stages; return the exit code."""
     if config.raylets < 2 and config.victims == ("raylet",):
@@ -302,29 +333,15 @@ def main(config: Config) -> int:
         print("error: mount namespaces are forbidden here (unshare -rm); use --stores disk", file=sys.stderr)
         return 2
     print(f"seed {config.seed}; {describe_machine()}", flush=True)
-    counts: Counter[str] = Counter()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="chaos-")))
-        stores: dict[str, Store] = {}
         has_mlflow = set(config.stages) != {"preprocess"}  # All other stages need a trained model.
-        for k in itertools.count(config.first):
-            if sum(counts[victim] for victim in VICTIMS) >= config.kills:
-                break
-            rng = random.Random(f"{config.seed} {k}")
-            kind, stage = config.stores[k % len(config.stores)], config.stages[k % len(config.stages)]
-            if kind not in stores:
-                stores[kind] = stack.enter_context(open_store(kind, folder / kind, config.raylets, has_mlflow))
-            stores[kind].run_undisturbed(stage)
-            killed = sum(counts[name] for name in VICTIMS)
-            victim = config.victims[killed % len(config.victims)] if config.victims else rng.choice(VICTIMS)
-            record = disturb(stores[kind], stage, f"run-{k}", victim, rng)
-            counts[record["killed"].split()[0].rstrip(":")] += 1
-            counts["different"] += bool(record["faults"])
-            counts["repeated"] += bool(record["repeated"])
-            print(" ".join(f"{name}={value}" for name, value in record.items() if name != "log" and value), flush=True)
-            if config.log:
-                with open(config.log, "a") as stream:
-                    stream.write(json.dumps(record) + "\n")
+
+        @cache
+        def get_store(kind: str) -> Store:
+            return stack.enter_context(open_store(kind, folder / kind, config.raylets, has_mlflow))
+
+        counts = run_kills(config, get_store)
     print(", ".join(f"{name}: {count}" for name, count in counts.items()))
     return 1 if counts["different"] else 0
 

@@ -73,7 +73,6 @@ SLOW_MODULES = (
     "test_cluster_storage",
     "test_elastic",
     "test_concurrent_jobs",
-    "test_chaos",
     "test_faults",
     "test_train_jobs",
     "test_commands",

@@ -11,11 +11,10 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
-from itertools import groupby
+from itertools import chain, groupby, product
 from typing import Any
 
 import numpy as np
-import ray.data
 import torch
 
 from models.geometry.encodings import ENCODINGS
@@ -31,7 +30,7 @@ from pipelines.reporting.chart import Chart, draw_chart_svg
 from pipelines.reporting.drawings_page import CaptionedSvg, DrawingsSection, render_page_html
 from pipelines.reporting.report import Table, Text
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import map_dataset
+from pipelines.runtime.ray_tasks import map_tasks
 
 TEST_COUNT = 2000
 TRAIN_KEY, TEST_KEY, NOISE_KEY = 0, 1, 2
@@ -92,13 +91,10 @@ def draw_training_boxes(trial: Trial) -> CenteredBoxes:
     return draw_boxes(BOX_DISTRIBUTIONS[trial.kind], trial.count, TRAIN_KEY, trial.seed)
 
 
-def run_trial(row: dict, directory: str, settings: StudyConfig, test_count: int) -> dict:
-    """Train one trial, score it on the shared test set and write DIRECTORY/<name>.json.
-
-    The input row holds the fields of a Trial. The output row holds the name of the trial.
-    """
+def run_trial(trial: Trial, directory: str, settings: StudyConfig, test_count: int) -> None:
+    """Train one trial, score it on the shared test set and write DIRECTORY/<name>.json."""
     torch.set_num_threads(1)
-    trial, started = Trial(**row), time.perf_counter()
+    started = time.perf_counter()
     moving_only = trial.numbers == "moving"
     fitted = train_autoencoder(ENCODINGS[trial.encoding], draw_training_boxes(trial), settings, trial.seed, moving_only)
     seconds = time.perf_counter() - started
@@ -115,7 +111,6 @@ def run_trial(row: dict, directory: str, settings: StudyConfig, test_count: int)
         "seconds": seconds,
     }
     storage.write_json(asdict(trial) | scores, storage.join_uri(directory, f"{trial.name}.json"))
-    return {"name": trial.name}
 
 
 def reconstruct_boxes(
@@ -145,17 +140,13 @@ def reconstruct_boxes(
     for trial in wanted:
         if on_trial and trial not in missing:
             on_trial()
-    if missing:
-        graph = map_dataset(
-            ray.data.from_items([asdict(trial) for trial in missing], override_num_blocks=len(missing)),
-            run_trial,
-            fn_kwargs={"directory": directory, "settings": settings, "test_count": test_count},
-            num_cpus=1,
-            compute=ray.data.TaskPoolStrategy(size=parallel),
-        )
-        for _ in graph.iter_rows():
-            if on_trial:
-                on_trial()
+
+    def train_and_score(trial: Trial) -> None:
+        run_trial(trial, directory, settings, test_count)
+
+    for _ in map_tasks(train_and_score, missing, at_once=parallel):
+        if on_trial:
+            on_trial()
     return [storage.read_json(path) for path in paths.values()]
 
 
@@ -220,21 +211,21 @@ def find_ranges(encoding: str) -> np.ndarray:
     return np.ptp(ENCODINGS[encoding].encode(*draw_boxes(BOX_DISTRIBUTIONS["any"], 10_000, TRAIN_KEY, 0)), axis=0)
 
 
-def compute_yaw_loss(row: dict, count: int) -> dict:
+def compute_yaw_loss(name: str, width_share: float, noise: float, count: int) -> dict:
     """Add noise to the encoding of `count` boxes, and compute the resulting loss of IoU3D.
 
-    The input row holds encoding, width_share and noise. The output row contains the input row and the scores. The noise
-    is Gaussian. The standard deviation of the noise is `noise` times the range of the entry over boxes of the
-    distribution "any". Constant entries therefore get no noise. `iou3d_lost_with_yaw` is the loss that the yaw error
-    alone causes. This loss is a difference: the IoU3D of a box with the true axes minus the IoU3D of the decoded box.
-    The extents along the true axes are computed from the decoded scatter matrix.
+    The result contains the first three arguments and the scores. The noise is Gaussian. The standard deviation of the
+    noise is `noise` times the range of the entry over boxes of the distribution "any". Constant entries therefore get
+    no noise. `iou3d_lost_with_yaw` is the loss that the yaw error alone causes. This loss is a difference: the IoU3D of
+    a box with the true axes minus the IoU3D of the decoded box. The extents along the true axes are computed from the
+    decoded scatter matrix.
     """
     torch.set_num_threads(1)
-    encoding, scale = ENCODINGS[row["encoding"]], find_ranges(row["encoding"])
+    encoding, scale = ENCODINGS[name], find_ranges(name)
     truth = draw_boxes(BOX_DISTRIBUTIONS["any"], count, NOISE_KEY)
-    truth.size_m[:, 1] = row["width_share"] * truth.size_m[:, 0]
+    truth.size_m[:, 1] = width_share * truth.size_m[:, 0]
     rng = np.random.default_rng(0)
-    noisy = encoding.encode(*truth) + row["noise"] * scale * rng.standard_normal((count, encoding.entries))
+    noisy = encoding.encode(*truth) + noise * scale * rng.standard_normal((count, encoding.entries))
     decoded = CenteredBoxes(*encoding.decode(noisy))
     turned = np.swapaxes(truth.rotation, 1, 2) @ decoded.rotation  # Decoded axes in the frame of the true box.
     along = np.einsum("nij,nj,nij->ni", turned, decoded.size_m, turned)
@@ -245,7 +236,7 @@ def compute_yaw_loss(row: dict, count: int) -> dict:
     flat = np.abs(turned[:, 2, :]).argmin(axis=1)  # Index of the most horizontal axis.
     x, y = (turned[np.arange(count), k, flat] for k in (0, 1))
     error = np.abs((np.arctan2(y, x) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
-    return dict(row) | {
+    return {"encoding": name, "width_share": width_share, "noise": noise} | {
         "iou3d": float(iou.mean()),
         "iou3d_lost_with_yaw": float((iou_aligned - iou).mean()),
         "yaw_error_deg": float(np.degrees(error).mean()),
@@ -254,9 +245,11 @@ def compute_yaw_loss(row: dict, count: int) -> dict:
 
 def compute_yaw_losses(count: int, shares: Sequence[float] = SHARES, noises: Sequence[float] = NOISES) -> list[dict]:
     """Run `compute_yaw_loss` for each encoding, footprint and noise, with one task per encoding and footprint."""
-    rows = [{"encoding": e, "width_share": s, "noise": n} for e in ENCODINGS for s in shares for n in noises]
-    graph = ray.data.from_items(rows, override_num_blocks=len(rows) // len(noises))
-    found = list(map_dataset(graph, compute_yaw_loss, fn_kwargs={"count": count}, num_cpus=1).iter_rows())
+
+    def compute_losses(item: tuple[str, float]) -> list[dict]:
+        return [compute_yaw_loss(*item, noise, count) for noise in noises]
+
+    found = chain.from_iterable(map_tasks(compute_losses, list(product(ENCODINGS, shares))))
     return sorted(found, key=lambda r: (list(ENCODINGS).index(r["encoding"]), r["width_share"], r["noise"]))
 
 

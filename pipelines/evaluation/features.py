@@ -23,7 +23,7 @@ from pipelines.metrics.controls import damage_scene
 from pipelines.metrics.relations import fuse_ground, measure_objects, summarise_relations
 from pipelines.rendering.render import render_bev
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import make_numbered_rows, map_actors, map_rows
+from pipelines.runtime.ray_tasks import map_actors, map_tasks
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.run_guard import guard_options
 from pipelines.schema.scene_subset import SceneSubset
@@ -400,18 +400,14 @@ def compute_scene_features(
     if on_scenes:
         on_scenes(sum(counts) - sum(counts[number] for number in missing))
 
-    def describe_scenes(row: dict) -> dict:
-        return compute_part(row["id"], shards, dataset, looks, directory)
+    def describe_scenes(number: int) -> dict:
+        return compute_part(number, shards, dataset, looks, directory)
 
     if isinstance(side, ImageFile):
         arguments = side.path, ranges, looks, directory
         rows = map_actors(missing, ImageFeatureExtractor, arguments, num_actors, READER_CPUS, uses_gpu=False)
     else:
-        rows = (
-            map_rows(make_numbered_rows(missing), describe_scenes, READER_CPUS, num_actors).iter_rows()
-            if missing
-            else ()
-        )
+        rows = map_tasks(describe_scenes, missing, READER_CPUS, num_actors)
     for row in rows:
         if on_scenes:
             on_scenes(row["scenes"])

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 import pyarrow as pa
-import ray.data
 
 from models.scene import Grid, Scene
 from pipelines.evaluation.features import READER_CPUS, load_scenes
@@ -22,7 +22,7 @@ from pipelines.metrics.seams import (
 from pipelines.rendering.render import MARK_COLOR, render_bev
 from pipelines.reporting.evaluation_report import format_value
 from pipelines.reporting.report import Picture, Pictures, Table, Text, render_report_html
-from pipelines.runtime.ray_tasks import flat_map_dataset, make_numbered_rows
+from pipelines.runtime.ray_tasks import map_tasks
 from pipelines.schema.scene_subset import SceneSubset, select_evenly
 from pipelines.schema.tables import Shard
 
@@ -84,20 +84,21 @@ class SeamMeasurement:
     seams: np.ndarray
 
 
-def measure_shard(row: dict, parts: list[tuple[Shard, list[int]]], lines: SeamLines, is_joined: bool) -> list[dict]:
-    """Measure the seams in the selected scenes of one shard; return one row with a flat record per scene."""
-    shard, rows = parts[row["id"]]
-    total, first = sum(len(r) for _, r in parts), sum(len(r) for _, r in parts[: row["id"]])
+def measure_shard(
+    parts: list[tuple[Shard, list[int]]], number: int, lines: SeamLines, is_joined: bool
+) -> list[tuple[str, int, np.ndarray]]:
+    """Measure the seams in the selected scenes of one shard; return scene id, number of seams and record per scene."""
+    shard, rows = parts[number]
+    total, first = sum(len(r) for _, r in parts), sum(len(r) for _, r in parts[:number])
     before = load_scenes(parts, np.arange(first - 1, first - 1 + len(rows)) % total) if is_joined else ()
     out = []
-    for number, scene in enumerate(shard.scenes(rows)):
+    for place, scene in enumerate(shard.scenes(rows)):
         if is_joined:
             across, along = [scene.grid.rows // 2], []
-            scene = join_unrelated_scenes(scene, before[number], across[0])
+            scene = join_unrelated_scenes(scene, before[place], across[0])
         else:
             across, along = lines.pixels(scene.grid)
-        record = measure_scene_seams(scene, across, along).ravel()
-        out.append({"scene_id": scene.scene_id, "seams": len(across) + len(along), "record": record})
+        out.append((scene.scene_id, len(across) + len(along), measure_scene_seams(scene, across, along)))
     return out
 
 
@@ -127,20 +128,16 @@ def measure_seams(
     parts = selection.shards()
     if is_joined and sum(len(rows) for _, rows in parts) < 2:
         raise ValueError(f"{selection.root}: one scene is selected; joined scenes need at least two")
-    graph = flat_map_dataset(
-        make_numbered_rows(range(len(parts))),
-        measure_shard,
-        fn_kwargs={"parts": parts, "lines": lines, "is_joined": is_joined},
-        num_cpus=READER_CPUS,
-        compute=ray.data.TaskPoolStrategy(size=min(num_tasks, len(parts))),
-    )
-    rows = []
-    for row in graph.iter_rows():
-        rows.append(row)
+
+    def measure_part(number: int) -> list[tuple[str, int, np.ndarray]]:
+        return measure_shard(parts, number, lines, is_joined)
+
+    found = []
+    for row in chain.from_iterable(map_tasks(measure_part, range(len(parts)), READER_CPUS, num_tasks)):
+        found.append(row)
         on_scene()
-    rows.sort(key=lambda row: row["scene_id"])
-    records = np.stack([row["record"] for row in rows]).reshape(len(rows), len(MEASURES), 2, 2)
-    return SeamMeasurement([row["scene_id"] for row in rows], records, np.array([row["seams"] for row in rows]))
+    names, seams, records = zip(*sorted(found, key=lambda row: row[0]), strict=True)
+    return SeamMeasurement(list(names), np.stack(records), np.array(seams))
 
 
 # ------------------------------------------------------------------------------------------------------ writing

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from itertools import chain
 
 import numpy as np
 import pyarrow as pa
 
-from pipelines.geometry.voxels import NUM_CLASSES, VoxelGrid, voxelize
+from pipelines.geometry.voxels import VoxelGrid, voxelize
 from pipelines.io.voxel_import import read_voxels
 from pipelines.metrics.reconstruction import compute_voxel_confusion, compute_voxel_scores
 from pipelines.preprocess.import_external import find_files, make_scene_id
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import flat_map_dataset, make_numbered_rows
+from pipelines.runtime.ray_tasks import map_tasks
 from pipelines.schema.axis_convention import Axes
 from pipelines.schema.palette import EMPTY
 from pipelines.schema.tables import Shard, find_shards
@@ -131,13 +132,12 @@ def load_true_voxels(chunk: list[VoxelPair], grid: VoxelGrid, axes: Axes) -> lis
     return [voxelize(scene, grid) for scene in shard.scenes([pair.truth.row for pair in chunk])]
 
 
-def score_chunk(row: dict, chunks: list[list[VoxelPair]], grid: VoxelGrid, axes: Axes, truth_axes: Axes) -> list[dict]:
-    """Compute the flat confusion matrix and the bytes on disk of each scene of a chunk."""
-    chunk = chunks[row["id"]]
+def score_chunk(chunk: list[VoxelPair], grid: VoxelGrid, axes: Axes, truth_axes: Axes) -> list[dict]:
+    """Compute the confusion matrix and the bytes on disk of each scene of a chunk."""
     return [
         {
             "scene_id": pair.name,
-            "confusion": compute_voxel_confusion(truth, read_voxels(pair.rebuilt, axes)).ravel(),
+            "confusion": compute_voxel_confusion(truth, read_voxels(pair.rebuilt, axes)),
             "rebuilt_bytes": storage.measure_file_bytes(pair.rebuilt),
             "stored_bytes": storage.measure_file_bytes(pair.stored) if pair.stored else -1,
         }
@@ -153,20 +153,17 @@ def score_voxels(
     on_scene: Callable[[], None] | None = None,
 ) -> tuple[dict, pa.Table]:
     """Return the scores over all scenes as a nested dictionary of numbers, and a table with one row per scene."""
-    chunks = split_chunks(pairs)
-    graph = flat_map_dataset(
-        make_numbered_rows(range(len(chunks))),
-        score_chunk,
-        fn_args=(chunks, grid, axes, truth_axes),
-        num_cpus=1,
-    )
+
+    def score(chunk: list[VoxelPair]) -> list[dict]:
+        return score_chunk(chunk, grid, axes, truth_axes)
+
     rows = []
-    for row in graph.iter_rows():
+    for row in chain.from_iterable(map_tasks(score, split_chunks(pairs))):
         rows.append(row)
         if on_scene:
             on_scene()
     rows.sort(key=lambda row: row["scene_id"])
-    confusions = [np.asarray(row["confusion"]).reshape(NUM_CLASSES, NUM_CLASSES) for row in rows]
+    confusions = [row["confusion"] for row in rows]
     scores = {
         "scenes": len(rows),
         "grid": {"rows": grid.shape[0], "cols": grid.shape[1], "levels": grid.shape[2]},

@@ -9,7 +9,6 @@ from itertools import islice
 
 import numpy as np
 import pyarrow as pa
-import ray.data
 
 from models.composition.inpaint import select_around_objects
 from models.scene import Scene
@@ -17,7 +16,7 @@ from pipelines.editing.edit import Edit, ObjectChange, replay_edits, serialize_e
 from pipelines.rendering.render import render_bev, render_outlined_bev
 from pipelines.reporting.report import Picture, Pictures, Section, Table, render_report_html
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import map_rows
+from pipelines.runtime.ray_tasks import map_tasks
 from pipelines.schema.run_guard import guard_run
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import EDITS, TABLES, Shard, make_rejects_table, require_written
@@ -179,9 +178,12 @@ def edit_scenes(
         {"shard": k, "is_written": shard.path("edits") in there, "has_rejects": shard.path("rejects") in there}
         for k, shard in enumerate(shards)
     ]
-    rows = ray.data.from_items(todo, override_num_blocks=len(parts))
+
+    def edit_shard(row: dict) -> dict:
+        return write_edited(row, request, parts)
+
     found = []
-    for row in map_rows(rows, lambda row: write_edited(row, request, parts)).iter_rows():
+    for row in map_tasks(edit_shard, todo):
         found.append(row)
         if on_shard:
             on_shard(row["scenes"])

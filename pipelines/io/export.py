@@ -10,7 +10,7 @@ from pipelines.io.mesh_export import export_glb, export_ply
 from pipelines.io.opendrive import export_opendrive
 from pipelines.io.voxel_import import export_voxels_npz
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import make_numbered_rows, map_rows
+from pipelines.runtime.ray_tasks import map_tasks
 from pipelines.schema.file_names import make_file_name
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, make_rejects_table
@@ -49,8 +49,8 @@ def export_scenes(
     parts = selection.shards()
     there = set() if overwrite else list_exported(output, formats)
 
-    def write(row: dict) -> dict:
-        shard, rows = parts[row["id"]]
+    def export_shard(number: int) -> dict:
+        shard, rows = parts[number]
         written, rejects, paths = [], [], []
         for scene in shard.scenes(rows):
             for kind in formats:
@@ -73,7 +73,7 @@ def export_scenes(
     counts: dict[Format, int] = dict.fromkeys(formats, 0)
     refused: dict[str, str] = {}
     promised: list[str] = []
-    for row in map_rows(make_numbered_rows(range(len(parts))), write).iter_rows():
+    for row in map_tasks(export_shard, range(len(parts))):
         for kind in row["written"]:
             counts[kind] += 1
         promised += row["paths"]

@@ -16,7 +16,6 @@ from typing import Literal
 
 import numpy as np
 import pyarrow as pa
-import ray.data
 
 from models.uris import is_uri, split_name, split_options
 from pipelines.io.mesh_import import import_glb
@@ -25,7 +24,7 @@ from pipelines.metrics.adm_npz import write_npz
 from pipelines.preprocess.shard_writer import join_tables
 from pipelines.runtime import storage
 from pipelines.runtime.npz import open_npz
-from pipelines.runtime.ray_tasks import map_rows
+from pipelines.runtime.ray_tasks import map_tasks
 from pipelines.schema.axis_convention import Axes
 from pipelines.schema.tables import Shard, find_faults, make_rejects_table, make_scene_tables, require_written
 from pipelines.schema.validation import validate_table
@@ -200,17 +199,17 @@ def read_files(request: ImportRequest, shard: Shard, read: Callable[[int, str, s
 # rejects, it is therefore complete, even if the writer was killed.
 
 
-def write_tables(row: dict, request: ImportRequest) -> dict:
+def write_tables(number: int, request: ImportRequest) -> dict:
     """Import the GLB files of one shard as tables.
 
     Args:
-        row: Row with the number of the shard.
+        number: Number of the shard.
         request: Import.
 
     Returns:
-        Row with the number of the shard and the scene ids.
+        Number of the shard and the scene ids.
     """
-    shard = request.shards()[row["shard"]]
+    shard = request.shards()[number]
 
     def tables(index: int, name: str, uri: str) -> dict[str, pa.Table]:
         scene = import_glb(uri, name, request.axes)
@@ -224,36 +223,36 @@ def write_tables(row: dict, request: ImportRequest) -> dict:
         return made
 
     if not shard.find_fault() and not storage.exists(shard.path("rejects")):
-        return {"shard": row["shard"], "scenes": shard.read("scenes", ["scene_id"])["scene_id"].to_pylist()}
+        return {"shard": number, "scenes": shard.read("scenes", ["scene_id"])["scene_id"].to_pylist()}
     names, parts = read_files(request, shard, tables)
     for table, content in join_tables(parts).items() if parts else ():
         storage.write_parquet(content, shard.path(table))
     if len(names) == len(list(request.files_of(shard))):
         storage.delete_file(shard.path("rejects"))
-    return {"shard": row["shard"], "scenes": names}
+    return {"shard": number, "scenes": names}
 
 
-def write_pictures(row: dict, request: ImportRequest) -> dict:
+def write_pictures(number: int, request: ImportRequest) -> dict:
     """Import the voxel grids of one shard as images.
 
     Args:
-        row: Row with the number of the shard.
+        number: Number of the shard.
         request: Import.
 
     Returns:
-        Row with the number of the shard and the scene ids.
+        Number of the shard and the scene ids.
     """
-    shard = request.shards()[row["shard"]]
+    shard = request.shards()[number]
     path = request.pictures_path(shard)
     if storage.exists(path) and not storage.exists(shard.path("rejects")):
-        return {"shard": row["shard"], "scenes": _read_part(path, "names").tolist()}
+        return {"shard": number, "scenes": _read_part(path, "names").tolist()}
     names, pictures = read_files(request, shard, lambda _, __, uri: draw_voxels(read_voxels(uri, request.axes)))
     content = io.BytesIO()
     np.savez_compressed(content, names=np.array(names, str), pictures=np.array(pictures, np.uint8))
     storage.write_whole(path, lambda stream: stream.write(content.getvalue()))
     if len(names) == len(list(request.files_of(shard))):
         storage.delete_file(shard.path("rejects"))
-    return {"shard": row["shard"], "scenes": names}
+    return {"shard": number, "scenes": names}
 
 
 def make_pictures_shard(path: str) -> np.ndarray:
@@ -307,9 +306,12 @@ def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None 
             return made
     storage.write_json(options, record)
     write = {"glb": write_tables, "npz": write_pictures}[request.kind]
-    rows = ray.data.from_items([{"shard": k} for k in range(len(shards))], override_num_blocks=len(shards))
+
+    def import_shard(number: int) -> dict:
+        return write(number, request)
+
     found = {}
-    for row in map_rows(rows, lambda row: write(row, request)).iter_rows():
+    for row in map_tasks(import_shard, range(len(shards))):
         found[row["shard"]] = list(row["scenes"])
         if on_shard:
             on_shard(len(list(request.files_of(shards[row["shard"]]))))

@@ -17,7 +17,7 @@ from pipelines.geometry.centerlines import extract_road_network, plan_drive
 from pipelines.rendering.pinhole import Lens, StreetCamera, StreetRenderer, StreetView, shade_view
 from pipelines.rendering.render import arrange_contact_sheet, encode_png
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import make_numbered_rows, map_rows
+from pipelines.runtime.ray_tasks import map_tasks
 from pipelines.schema.file_names import make_file_name
 from pipelines.schema.palette import CLASS_ID
 from pipelines.schema.run_guard import find_changed_option
@@ -214,8 +214,8 @@ def render_streets(
     storage.write_json(asdict(request), record)
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
 
-    def write(row: dict) -> dict:
-        shard, position = chosen[row["id"]]
+    def write_scene(number: int) -> dict:
+        shard, position = chosen[number]
         (scene,) = shard.scenes([position])
         there = set(storage.list_files(directory := request.directory(scene.scene_id), ""))
         if (cameras := storage.join_uri(directory, "cameras.json")) in there:
@@ -225,7 +225,7 @@ def render_streets(
         return {"scene_id": scene.scene_id, "frames": write_street(scene, request)}
 
     frames = {}
-    for row in map_rows(make_numbered_rows(range(len(chosen))), write).iter_rows():
+    for row in map_tasks(write_scene, range(len(chosen))):
         frames[row["scene_id"]] = row["frames"]
         if on_scene:
             on_scene()

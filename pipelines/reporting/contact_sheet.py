@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from typing import Literal, NamedTuple, cast
 
 import numpy as np
@@ -50,7 +51,7 @@ class View:
         return render_3d(scene, self.size_px, 3 * self.size_px // 4)
 
 
-def paint_scenes(row: dict, views: tuple[View, ...]) -> list[dict]:
+def paint_scenes(row: dict, views: tuple[View, ...]) -> list[tuple[int, int, np.ndarray]]:
     """Render the scenes that an input row lists.
 
     Args:
@@ -58,14 +59,13 @@ def paint_scenes(row: dict, views: tuple[View, ...]) -> list[dict]:
         views: Views to render.
 
     Returns:
-        One row per picture: position of its scene in the result, index of the view, shape and bytes.
+        For each picture, the position of its scene in the result, the index of the view, and (H, W, 3) uint8.
     """
     shard = Shard(row["root"], row["source"], row["split"], row["number"])
     out = []
     for place, scene in zip(row["places"], shard.scenes(list(row["rows"])), strict=True):
         for view, kind in enumerate(views):
-            picture = kind.picture(scene)
-            out.append({"place": place, "view": view, "shape": list(picture.shape), "picture": picture.tobytes()})
+            out.append((place, view, kind.picture(scene)))
     return out
 
 
@@ -83,19 +83,18 @@ def paint_scene(
     Returns:
         One list per scene, with one picture per view.
     """
-    import ray.data
-
-    from pipelines.runtime.ray_tasks import flat_map_dataset
+    from pipelines.runtime.ray_tasks import map_tasks
 
     tasks = [
         {**asdict(shard), "rows": rows, "places": places} for shard, rows, places in catalogue.chunks(indices, CHUNK)
     ]
-    rows = ray.data.from_items(tasks, override_num_blocks=len(tasks))
-    graph = flat_map_dataset(rows, paint_scenes, fn_kwargs={"views": views})
+
+    def paint_chunk(row: dict) -> list[tuple[int, int, np.ndarray]]:
+        return paint_scenes(row, views)
+
     pictures: list[list] = [[None] * len(views) for _ in indices]
-    for row in graph.iter_rows():
-        picture = np.frombuffer(row["picture"], np.uint8).reshape(row["shape"])
-        pictures[row["place"]][row["view"]] = picture
+    for place, view, picture in chain.from_iterable(map_tasks(paint_chunk, tasks)):
+        pictures[place][view] = picture
         if on_picture:
             on_picture()
     return pictures

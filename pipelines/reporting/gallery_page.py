@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from html import escape
 from importlib.resources import files
+from itertools import chain
 
 import numpy as np
 import pyarrow as pa
@@ -53,15 +54,14 @@ def render_gallery_html(
     catalogue: Catalogue, indices: np.ndarray, title: str, on_scene: Callable[[], None] | None = None
 ) -> str:
     """Render the page; its size is about 35 kB per scene. Each Ray task converts up to CHUNK scenes of a shard."""
-    import ray.data
+    from pipelines.runtime.ray_tasks import map_tasks
 
     tasks = [
         {**asdict(shard), "rows": rows, "places": places} for shard, rows, places in catalogue.chunks(indices, CHUNK)
     ]
-    graph = ray.data.from_items(tasks, override_num_blocks=len(tasks)).flat_map(pack_scenes)
     values = list_scene_values(catalogue, indices)
     scenes: list[dict] = [{}] * len(indices)
-    for row in graph.iter_rows():
+    for row in chain.from_iterable(map_tasks(pack_scenes, tasks)):
         scenes[row["place"]] = {
             "values": values[row["place"]],
             "picture": row["picture"],

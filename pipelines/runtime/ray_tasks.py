@@ -1,10 +1,11 @@
-"""Run numbered units of work as Ray Data graphs, with one task per unit or with actors that keep a model loaded."""
+"""Run units of work with one Ray task per unit, or as Ray Data graphs, also with actors that keep a model loaded."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, cast
+from itertools import islice
+from typing import Any, TypeVar, cast
 
 import ray
 import ray.data
@@ -15,6 +16,45 @@ from pipelines.runtime.resources import Resources, make_model_resources, require
 # Number of retries for a task whose worker died. Ray replaces a killed worker. If a shard kills each worker that reads
 # it, the run stops.
 MAX_RETRIES = 20
+TASKS_PER_CPU = 4
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def map_tasks(
+    function: Callable[[Item], Result], items: Sequence[Item], num_cpus: float = 1, at_once: int | None = None
+) -> Iterator[Result]:
+    """Call a function in one Ray task per item, and retry a task whose worker died.
+
+    At most TASKS_PER_CPU tasks per CPU of the cluster wait or run, so the driver's memory does not depend on the number
+    of items. If a task fails, the other tasks are cancelled.
+
+    Args:
+        function: Function of an item. Its name is the name of the tasks.
+        items: One item per unit of work.
+        num_cpus: Number of CPUs per task.
+        at_once: Maximum number of concurrent tasks (default: no limit).
+
+    Yields:
+        Results in order of completion.
+    """
+    task = ray.remote(num_cpus=num_cpus, max_retries=MAX_RETRIES)(function)
+    waiting = iter(items)
+    running: list[ray.ObjectRef] = []
+    try:
+        while True:
+            limit = at_once or int(TASKS_PER_CPU * max(1, ray.cluster_resources().get("CPU", 1)))
+            running += [
+                task.options(name=function.__name__).remote(item) for item in islice(waiting, limit - len(running))
+            ]
+            if not running:
+                return
+            done, running = ray.wait(running)
+            yield ray.get(done[0])
+    finally:
+        for reference in running:
+            ray.cancel(reference)
 
 
 def make_numbered_rows(numbers: Sequence[int]) -> ray.data.Dataset:

@@ -168,7 +168,7 @@ def test_cholesky_error_of_square_equals_closed_form():
 
 def test_cholesky_loses_yaw_of_squares_and_octahedral_keeps_it():
     def compute_loss(encoding, share):
-        return compute_yaw_loss({"encoding": encoding, "width_share": share, "noise": 1e-3}, 400)["iou3d_lost_with_yaw"]
+        return compute_yaw_loss(encoding, share, 1e-3, 400)["iou3d_lost_with_yaw"]
 
     assert abs(compute_loss("cholesky", 1.0) - (1 - LOST_YAW_IOU3D)) < 0.02
     assert compute_loss("cholesky", 0.9) > 4 * compute_loss("cholesky", 0.5)
