@@ -177,13 +177,13 @@ def find_paper_hours(row: Row) -> int:
 
 def format_table(rows: list[Row], config: Config) -> str:
     """Return the rows as a Markdown table."""
-    lines = ["| project | stage | units | GPU h | CPU h | writes | reads | stored GB | price |"]
-    lines.append("|---" * 9 + "|")
+    lines = ["| project | stage | units | GPU h | CPU h | writes / reads | stored GB | price |"]
+    lines.append("|---" * 8 + "|")
     for row in rows:
         gpu = f"{row.gpu_hours:,.2f}" + (f" (paper: {p})" if (p := find_paper_hours(row)) else "")
         lines.append(
             f"| {row.project} | {row.stage} | {row.units} | {gpu if row.gpu_hours else '0'} | {row.cpu_hours:,.1f} |"
-            f" {row.writes:,.0f} | {row.reads:,.0f} | {row.gigabytes:,.2f} | {row.price(config):,.2f} |"
+            f" {row.writes:,.0f} / {row.reads:,.0f} | {row.gigabytes:,.2f} | {row.price(config):,.2f} |"
         )
     return "\n".join(lines)
 

@@ -1,12 +1,13 @@
 """Tests of the cost model against calculations by hand and against published FLOP counts."""
 
+import json
 import sys
 
 import pytest
 from helpers import ROOT
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
-from cost_rates import Usage, count_requests, make_rate
+from cost_rates import RATES, Usage, count_requests, make_rate
 from costs import Config, Row, Work, count_dit_flops, estimate, format_table
 
 RATE = {"cpu_s": 3.6, "writes": 0.5, "reads": 2.0, "stored_bytes": 1e6}
@@ -39,6 +40,13 @@ def test_flops_of_dit_equal_published_counts():
     """DiT-B/2 on a latent of 32 x 32 has 23.0 billion multiply-adds (Peebles and Xie 2023, table 4)."""
     _, denoise = count_dit_flops("kitti360", channels=64, size=32)
     assert denoise == pytest.approx(2 * 23.0e9, rel=0.02)
+
+
+def test_page_holds_the_measured_stages():
+    rows = format_table(list(estimate(Config(), WORK, json.loads(RATES.read_text())["per_unit"])), Config()).split("\n")
+    page = (ROOT / "docs/reference/costs.md").read_text()
+    measured = [row for row in rows if "preprocess" in row or "evaluate" in row]
+    assert len(measured) == 3 and all(row in page for row in measured)
 
 
 def test_rates_exclude_what_both_runs_need(tmp_path):
