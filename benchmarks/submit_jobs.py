@@ -37,7 +37,7 @@ preprocess_scenes town --num-train 48 --num-test 24
 train_lvae smoke --dataset @/datasets/town --name small-lvae --steps 24
 encode_latents --dataset @/datasets/town --lvae @/models/small-lvae
 train_dit smoke --dataset @/datasets/town --name small --steps 24 --num-workers 2
-sample_scenes --model @/models/pritti-small --num-scenes 24 --num-inference-steps 4 --existence-threshold 0.01
+sample_scenes --model @/models/pritti-small --num-scenes 24 --num-inference-steps 4 --run small --output @/small
 sample_scenes --model town --num-scenes 24 --sampler dpm++ --num-inference-steps 10 --run town --output @/town
 outpaint_scenes --model town --input @/town --guided --num-inference-steps 20
 inpaint_scenes --model town --input @/town --half-plane 1 0 32 --guided --num-inference-steps 20 --output @/inpainted
@@ -50,7 +50,8 @@ evaluate_voxels --ground-truth @/exports/npz --reconstructed @/exports/npz --out
 render_streets --input @/town --max-scenes 2 --spacing-m 16 --width-px 176 --height-px 48 --output @/town
 paint_streets --streets @/town/streets/drive --diffusion DIFFUSION --controlnet CONTROLNET --num-inference-steps 2
 inspect_scenes report --dataset @/town --num-examples 2
-publish_model --name small --model @/models/pritti-small --evaluation @/evaluations/town --output @/zoo
+evaluate_scenes --real @/datasets/town --generated @/small --run small --lvae @/models/small-lvae --lite0 False
+publish_model --name small --model @/models/pritti-small --evaluation @/evaluations/small --output @/zoo
 sample_scenes --model models:/small/1 --num-scenes 4 --num-inference-steps 4 --output @/registered
 sweep_samplers --model town --num-scenes 24 --samplers dpm++ --num-inference-steps 4
 sweep_seams --model town --input @/town --max-scenes 1 --settings 4 1 1 1 0

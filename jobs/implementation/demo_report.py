@@ -15,7 +15,18 @@ from pipelines.preprocess.sources.town.reference_statistics import measure_town
 from pipelines.rendering.render import render_3d, render_bev
 from pipelines.reporting.chart import Chart
 from pipelines.reporting.evaluation_report import build_score_table, build_validity_table
-from pipelines.reporting.report import Charts, Figure, KeyFigures, Picture, Pictures, Section, Table, Text, write_report
+from pipelines.reporting.report import (
+    Charts,
+    Figure,
+    KeyFigures,
+    Picture,
+    Pictures,
+    Section,
+    Table,
+    Text,
+    render_report_html,
+)
+from pipelines.runtime import storage
 from pipelines.schema.tables import read_scenes
 
 SHOWN = 4
@@ -91,7 +102,8 @@ def write_demo_report(path: str, config: Config, scores: dict, seconds: dict[str
         *score_sections(scores, data),
         *make_closing_sections(config, seconds),
     ]
-    write_report(path, "PrITTI on Ray: the demo", sections, "Primitive-based generation of 3D semantic urban scenes")
+    subtitle = "Primitive-based generation of 3D semantic urban scenes"
+    storage.write_text(render_report_html("PrITTI on Ray: the demo", sections, subtitle), path)
 
 
 def make_introduction_sections(

@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from pathlib import Path
 from typing import NamedTuple
-from uuid import uuid4
 
 import numpy as np
 from PIL import Image
@@ -112,14 +109,6 @@ class Table:
 
 
 Section = Text | KeyFigures | Pictures | Charts | Table
-
-
-def write_report(path: str | Path, title: str, sections: Sequence[Section], subtitle: str = "") -> None:
-    """Write the result of `render_report_html` to a temporary file and move it to `path`."""
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
-    temporary.write_text(render_report_html(title, sections, subtitle), encoding="utf-8")
-    os.replace(temporary, path)
 
 
 def render_report_html(title: str, sections: Sequence[Section], subtitle: str = "") -> str:

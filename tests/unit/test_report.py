@@ -19,7 +19,6 @@ from pipelines.reporting.report import (
     Table,
     Text,
     render_report_html,
-    write_report,
 )
 
 
@@ -72,12 +71,6 @@ def test_report_keeps_pictures(sections):
     ]
     assert np.array_equal(decoded[0], flat)  # the PNG keeps exact class colours
     assert decoded[1].shape == shaded.shape and np.abs(decoded[1].astype(int) - shaded).mean() < 4
-
-
-def test_write_report_is_atomic(tmp_path, sections):
-    write_report(tmp_path / "report.html", "Demo", sections)
-    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
-    assert (tmp_path / "report.html").read_text("utf-8") == render_report_html("Demo", sections)
 
 
 def test_report_rejects_table_of_wrong_shape():
