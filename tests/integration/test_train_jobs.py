@@ -96,27 +96,33 @@ def test_train_lvae_leaves_finished_run_unchanged(home):
         train(Config(preset="smoke", learning_rate=0.5))
 
 
-def test_train_lvae_resumes_after_worker_kill(home, tmp_path):
-    """A worker dies during training, and Ray Train starts another worker from the last checkpoint."""
+def test_train_lvae_resumes_after_worker_kills(home, tmp_path, monkeypatch, capsys):
+    """A worker dies twice. Ray Train may replace it once; the second round begins because there is a checkpoint."""
+    import jobs.support.trainer
     from jobs.implementation.train_lvae import prepare
     from jobs.support.trainer import fit
     from jobs.train_lvae import Config
 
-    marker, seen = str(tmp_path / "died"), tmp_path / "validated"
+    monkeypatch.setattr(jobs.support.trainer, "RETRIES", 1)
+    seen = tmp_path / "validated"
     run = prepare(Config(preset="smoke", name="lvae-killed", checkpoint_every=3))
     first = run.reader
 
-    class DieOnce:
+    class DieTwice:
         def __call__(self, trainer):
             with seen.open("a") as file:
                 print(trainer.steps_done, file=file)
-            if trainer.steps_done >= 6 and not os.path.exists(marker):
-                open(marker, "w").close()
+            if trainer.steps_done >= 6 and seen.read_text().count("6") < 3:
                 os.kill(os.getpid(), 9)
             return {}, {}
 
-    output = fit(replace(run, validate=DieOnce(), reader=first), 1, str(home / "models/lvae-killed"))
-    assert seen.read_text().split() == ["3", "6", "6", "8"]  # the worker dies at step 6; training resumes at step 3
+    output = fit(replace(run, validate=DieTwice(), reader=first), 1, str(home / "models/lvae-killed"))
+    # The worker dies at step 6. Training resumes at step 3.
+    assert seen.read_text().split() == ["3", "6", "6", "6", "8"]
+    assert (
+        "lvae-killed: workers failed 2 times, but there is a new checkpoint; training continues"
+        in capsys.readouterr().out
+    )
     whole, resumed = load_weights(home / "models/lvae-smoke"), load_weights(Path(output))
     assert all((whole[k] == resumed[k]).all() for k in whole)
 
