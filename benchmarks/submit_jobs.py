@@ -16,6 +16,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -31,6 +32,10 @@ from raylets import RAY, ROOT, Cluster
 HOME = "s3://tests/home"
 JOB_TIMEOUT_S = 900
 SHOWN = 2  # Number of lines of each output.
+WIDTH = 112
+OTHERS = re.compile(  # Lines of Ray and MLflow, bars of progress and tables.
+    r"\(|\d{4}-\d\d-\d\d |[-=]{5}|Job |Next steps|Query|Ask|Tailing|Running entrypoint|🧪|🏃|.*\d+%\||[│└┗╰ ]"
+)
 # @ is the home directory.
 JOBS = """
 preprocess_scenes town --num-train 48 --num-test 24
@@ -98,17 +103,13 @@ def submit_and_wait(cluster: Cluster, settings: Path, words: list[str]) -> tuple
 
 
 def format_transcript(words: list[str], output: str, seconds: float) -> str:
-    """Return a command and the last lines of its output, without Ray's own lines and without bars of progress."""
-    ours = [
-        line
-        for line in re.sub(r"\x1b\[[0-9;]*m", "", output).splitlines()
-        if line.strip()
-        and not re.match(
-            r"\(|\d{4}-\d\d-\d\d |[-=]{5}|Job |Next steps|Query|Ask|Tailing|Running entrypoint|🧪|🏃|.*\d+%\|", line
-        )
-    ]
-    command = "ray job submit --runtime-env env.yaml -- " + " ".join(words)
-    return "\n".join([f"$ {command}", *(line[:160] for line in ours[-SHOWN:]), f"# {seconds:.0f} s", ""])
+    """Return a command and the last lines of its output, without Ray's own lines, bars of progress and tables."""
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", output).splitlines()
+    ours = [line for line in lines if line.strip() and not OTHERS.match(line)]
+    line = "$ ray job submit --runtime-env env.yaml -- " + " ".join(words)
+    command = " \\\n    ".join(textwrap.wrap(line, WIDTH, break_on_hyphens=False))
+    shown = [command, *(line[:WIDTH] for line in ours[-SHOWN:])]
+    return "\n".join([*shown, f"# {seconds:.0f} s", ""])
 
 
 def submit_studio(cluster: Cluster, settings: Path, words: list[str]) -> tuple[str, float]:
