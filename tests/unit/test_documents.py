@@ -1,6 +1,7 @@
 """Tests that README and docs follow the rules of CONTRIBUTING: length, plain expressions, valid paths and links."""
 
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -90,6 +91,16 @@ def test_every_page_is_in_the_navigation():
             assert f"({name.removeprefix('experiments/')})" in index, page
         elif page.startswith("docs/"):
             assert name in navigation, page
+
+
+def test_transcript_of_the_cluster_shows_every_job():
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    from submit_jobs import JOBS
+
+    jobs = {path.stem for path in (ROOT / "jobs").glob("[!_]*.py")}
+    assert len(jobs) > 20 and {line.split()[0] for line in JOBS.strip().splitlines()} == jobs
+    page = (ROOT / "docs/how_to/cluster.md").read_text()
+    assert set(re.findall(r"ray job submit .*-- jobs/(\w+)\.py", page)) == jobs
 
 
 def test_experiments_are_dated():
