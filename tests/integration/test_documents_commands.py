@@ -21,8 +21,15 @@ SAMPLE = "jobs/sample_scenes.py --model town --num-scenes 2 --sampler dpm++ --nu
 BEFORE = dict.fromkeys(
     ("docs/how_to/edit_scenes.md", "docs/how_to/street_views.md", "docs/how_to/import_scenes.md"), SAMPLE
 )
-# Pages whose commands take more than a minute. Other tests run the same jobs with smaller settings.
-SLOW_PAGES = ("docs/concepts/sampling.md", "docs/how_to/own_drives.md", "docs/how_to/publish_weights.md")
+# Pages whose commands take long. Other tests run the same jobs with smaller settings.
+SLOW_PAGES = (
+    "docs/concepts/sampling.md",
+    "docs/how_to/edit_scenes.md",
+    "docs/how_to/import_scenes.md",
+    "docs/how_to/own_drives.md",
+    "docs/how_to/publish_weights.md",
+    "docs/how_to/street_views.md",
+)
 RUN_PAGES = [
     pytest.param(page, marks=[pytest.mark.slow] if page in SLOW_PAGES else [])
     for page in PAGES

@@ -86,6 +86,7 @@ def test_sample_passes_repair_option(smoke, tmp_path, monkeypatch):
     assert [request.repair for request in requests] == [False, True]
 
 
+@pytest.mark.slow
 def test_sweep_samplers_scores_each_sampler_and_resumes(smoke, tmp_path):
     from jobs.implementation.sweep_samplers import sweep_samplers
     from jobs.sweep_samplers import Config

@@ -127,6 +127,7 @@ def test_train_lvae_resumes_after_worker_kills(home, tmp_path, monkeypatch, caps
     assert all((whole[k] == resumed[k]).all() for k in whole)
 
 
+@pytest.mark.slow  # test_train_lvae_with_two_workers_matches_one uses the same trainer.
 def test_train_dit_with_three_workers_matches_one_and_resumes(home, tmp_path, monkeypatch):
     import jobs.support.trainer
     from jobs.implementation.train_dit import prepare, train
@@ -166,7 +167,6 @@ def test_train_dit_with_three_workers_matches_one_and_resumes(home, tmp_path, mo
         train(Config(preset="smoke", name="dit-odd", num_workers=2, batch_size=1))
 
 
-@pytest.mark.slow  # test_train_dit_with_three_workers_matches_one_and_resumes uses the same trainer.
 def test_train_lvae_with_two_workers_matches_one(home):
     from jobs.implementation.train_lvae import train
     from jobs.train_lvae import Config
@@ -177,6 +177,7 @@ def test_train_lvae_with_two_workers_matches_one(home):
     assert distance < 1e-2, distance
 
 
+@pytest.mark.slow
 def test_train_lvae_retrains_object_decoder_for_kept_latents(home):
     from jobs.implementation.train_lvae import train
     from jobs.train_lvae import Config
