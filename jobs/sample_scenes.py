@@ -53,6 +53,14 @@ class Config:
     wait_for_resources_s: WaitForResourcesOption = 0.0
     batch_size: int = 8
     """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding."""
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """Precision of the transformer (paper: fp32). bf16 is faster on GPUs and changes scenes by rounding."""
+    cuda_graphs: bool = False
+    """Replay each denoising step as one CUDA graph; faster for small batches, and ignored without a GPU."""
+    compile: bool = False
+    """Compile the transformer's block with torch.compile, which takes a minute; useful on GPUs."""
+    decode_batch_size: int = 1
+    """Number of latents decoded together; more than 1 is faster on GPUs and changes scenes by rounding."""
     num_glb: int = 0
     """Number of scenes, from the first, to export as GLB to <output>/glb/<run>."""
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -42,6 +42,7 @@ from models.sampling.diffusion import (
     scale_noise,
     with_guidance,
 )
+from models.sampling.execution import SamplingExecution
 from models.sampling.repaint import NUM_INFERENCE_STEPS, RePaintConfig
 from models.sampling.schedulers import SchedulerConfig
 from models.scene import Scene
@@ -131,6 +132,7 @@ class PrITTIPipeline:
         if scheduler is not None:
             self.scheduler = scheduler
         self.config = Config(noise_scaling=noise_scaling, existence_threshold=existence_threshold)
+        self.execution = SamplingExecution()
         self._progress_bar: dict[str, Any] = {}
         if dit.config.layout is not None:
             self.spec.require(LayoutSpec.from_dict(dit.config.layout), "the DiT")
@@ -275,6 +277,18 @@ class PrITTIPipeline:
         self.dit.to(*args, **kwargs)
         return self
 
+    def set_execution(self, execution: SamplingExecution) -> None:
+        """Select precision, CUDA graphs, compilation and the batch size of decoding.
+
+        Args:
+            execution: Options. The precision and the compilation cannot be taken back, so load the pipeline again.
+
+        Raises:
+            ValueError: The GPU has no bfloat16.
+        """
+        execution.prepare(self.dit)
+        self.execution = execution
+
     @property
     def device(self) -> torch.device:
         """Device of the networks."""
@@ -338,7 +352,8 @@ class PrITTIPipeline:
     ) -> list[Scene]:
         """Decode latents to scenes.
 
-        Latents are decoded one at a time. Each scene is therefore bit-identical for any batch size.
+        By default, latents are decoded one at a time. Each scene is therefore bit-identical for any batch size. With
+        `SamplingExecution.decode_batch_size`, scenes are equal up to rounding.
 
         Args:
             latents: Latents.
@@ -358,7 +373,8 @@ class PrITTIPipeline:
         shift, scale = self._moments()
         if not torch.isfinite(latents).all():  # Decoded, such a latent would give an empty scene.
             raise ValueError("a latent holds NaN or infinity: the weights of the model are damaged")
-        layouts = [self.lvae.decode(latent[None] * scale + shift).layouts()[0] for latent in latents]
+        parts = latents.split(self.execution.decode_batch_size)
+        layouts = [layout for part in parts for layout in self.lvae.decode(part * scale + shift).layouts()]
         scenes = [
             decode_layout(layout, self.spec, identity, threshold)
             for layout, identity in zip(layouts, identities, strict=True)
@@ -404,11 +420,24 @@ class PrITTIPipeline:
         """
         return torch.tensor([find_label_index(self.dit.config.label, name) for name in labels], device=self.device)
 
-    def _denoiser(self, timesteps: np.ndarray | Tensor, label: Tensor, guidance_scale: float) -> Denoiser:
-        """Return the DiT with classifier-free guidance and precomputed modulations."""
+    def make_denoiser(
+        self, timesteps: np.ndarray | Tensor, label: Int[Tensor, " b"], guidance_scale: float = 1.0
+    ) -> Denoiser:
+        """Return the DiT with classifier-free guidance and precomputed modulations, run as `set_execution` says.
+
+        Args:
+            timesteps: All timesteps that the denoiser will receive.
+            label: Class index of each scene.
+            guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
+
+        Returns:
+            Function that maps latents (b, c, h, w), timesteps (b,) and labels (b,) to noise.
+        """
         null = self.dit.null_label
         labels = label.tolist() if guidance_scale == 1.0 else [*label.tolist(), null]
-        return with_guidance(self.dit.precompute_conditioning(timesteps.tolist(), labels), null, guidance_scale)
+        with self.execution.autocast(self.device):
+            model = with_guidance(self.dit.precompute_conditioning(timesteps.tolist(), labels), null, guidance_scale)
+        return self.execution.wrap(model, self.device)
 
     def resolve_noise_scaling(self, noise_scaling: float | None) -> float:
         """Return a noise scaling, or the default of the current sampler if the argument is None.
@@ -490,7 +519,7 @@ class PrITTIPipeline:
         with self._step_callback(num_inference_steps, callback_on_step_end) as on_step:
             if self.uses_ddpm:
                 schedule = SamplingSchedule(self.diffusion, num_inference_steps)
-                model = scale_noise(self._denoiser(schedule.timesteps, label, guidance_scale), noise_scaling)
+                model = scale_noise(self.make_denoiser(schedule.timesteps, label, guidance_scale), noise_scaling)
                 return sample(model, schedule, noise, label, on_step=on_step)
             # Raise an error for an invalid number of steps; diffusers would accept it.
             self.diffusion.select_timesteps(num_inference_steps)
@@ -501,7 +530,7 @@ class PrITTIPipeline:
                     f"{self.scheduler_config.class_name} uses fractional timesteps, which the DiT does not support; "
                     "use DPM-Solver++ or DDIM"
                 )
-            model = scale_noise(self._denoiser(timesteps, label, guidance_scale), noise_scaling)
+            model = scale_noise(self.make_denoiser(timesteps, label, guidance_scale), noise_scaling)
             return sample_with_scheduler(model, self.scheduler, noise, label, on_step)
 
     def generate(
@@ -587,7 +616,7 @@ class PrITTIPipeline:
         noise = SceneNoise(seed, indices, self.latent_shape, self.device, purpose)
         label = self.label_tensor(labels)
         scaling = 1.0 if repaint.eta == 1 else self.config.noise_scaling
-        model = scale_noise(self._denoiser(schedule.timesteps, label, guidance_scale), scaling)
+        model = scale_noise(self.make_denoiser(schedule.timesteps, label, guidance_scale), scaling)
         with self._step_callback(repaint.num_evaluations, callback_on_step_end) as on_step:
             return sample(
                 model,

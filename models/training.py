@@ -29,7 +29,7 @@ from models.batch import LayoutBatch
 from models.dit import DiT
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.sampling.diffusion import make_keyed_generator
+from models.sampling.diffusion import finish_drawing, make_keyed_generator, start_drawing
 from models.vae.losses import compute_lvae_loss
 from models.vae.matching import NonFiniteCostError
 
@@ -151,6 +151,8 @@ def sample_noise(generators: list[torch.Generator], shape: tuple[int, ...], devi
     Returns:
         (b, *shape) noise.
     """
+    if device.type == "cuda":  # For large batches, one thread would need longer than the GPU for the step.
+        return finish_drawing(*start_drawing(generators, shape, device), device)
     return torch.stack([torch.randn(shape, generator=generator) for generator in generators]).to(device)
 
 

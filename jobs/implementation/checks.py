@@ -105,7 +105,7 @@ def check_preprocess_scenes(config: Town | Kitti360 | Av2 | Own) -> None:
 
 
 def check_sample_scenes(config: SampleConfig) -> None:
-    require_positive(config, "num_scenes", "num_inference_steps", "num_actors", "batch_size")
+    require_positive(config, "num_scenes", "num_inference_steps", "num_actors", "batch_size", "decode_batch_size")
     require_model_labels(find_pipeline_directory(config.model), config.labels)
 
 

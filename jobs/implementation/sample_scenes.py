@@ -11,6 +11,7 @@ from jobs.support.model_directories import find_pipeline_directory, read_label_k
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from models.labels import LABELS
+from models.sampling.execution import SamplingExecution
 from pipelines.generation.sample import SampleRequest, sample_scenes
 from pipelines.io.mesh_export import export_glb
 from pipelines.runtime import storage
@@ -37,6 +38,7 @@ def sample(config: Config) -> str:
         existence_threshold=config.existence_threshold,
         repair=config.repair,
         shard_scenes=min(64, max(1, -(-config.num_scenes // 8))),
+        execution=SamplingExecution(config.precision, config.cuda_graphs, config.compile, config.decode_batch_size),
     )
     with hold_output(output, request.source, config):
         columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TaskProgressColumn(show_speed=True))

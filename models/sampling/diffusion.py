@@ -7,9 +7,11 @@ states (repaint.py).
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -167,10 +169,54 @@ class SamplingSchedule:
 GENERATE, OUTPAINT, INPAINT = 1, 2, 3
 
 
+@cache
+def start_noise_threads() -> ThreadPoolExecutor:
+    """Return the threads that draw noise for GPUs; they start with the first draw."""
+    return ThreadPoolExecutor(min(8, os.cpu_count() or 1), "noise")
+
+
+def start_drawing(
+    generators: Sequence[torch.Generator], shape: tuple[int, ...], device: torch.device
+) -> tuple[Float[Tensor, "b ..."], list[Future]]:
+    """Start to draw standard normal noise in threads, with one generator per sample.
+
+    Args:
+        generators: Generators of the CPU.
+        shape: Shape of the noise of one sample.
+        device: Device that will use the noise. Copies from pinned memory to a GPU do not wait for the GPU.
+
+    Returns:
+        Memory of the CPU for the noise, and one future per sample. The noise is complete when all futures are done.
+    """
+    noise = torch.empty((len(generators), *shape), pin_memory=device.type == "cuda")
+    threads = start_noise_threads()
+    parts = zip(generators, noise, strict=True)
+    return noise, [threads.submit(torch.randn, shape, generator=g, out=part) for g, part in parts]
+
+
+def finish_drawing(
+    noise: Float[Tensor, "b ..."], parts: Sequence[Future], device: torch.device
+) -> Float[Tensor, "b ..."]:
+    """Wait for the noise of `start_drawing`.
+
+    Args:
+        noise: Memory of the noise.
+        parts: One future per sample.
+        device: Device of the result.
+
+    Returns:
+        Noise on the device.
+    """
+    for part in parts:
+        part.result()
+    return noise.to(device, non_blocking=True)
+
+
 class SceneNoise:
     """Standard normal noise. Each scene has a separate sequence, determined by seed, scene key and purpose.
 
-    The noise of a scene does not depend on the batch size, the number of workers or the other scenes of the batch.
+    The noise of a scene does not depend on the batch size, the number of workers or the other scenes of the batch. It
+    is drawn on the CPU, so it is equal for all devices. For a GPU, threads draw the next noise while the GPU works.
 
     Args:
         seed: One seed for all scenes, or one per scene.
@@ -178,6 +224,7 @@ class SceneNoise:
         shape: Shape of the noise of one scene.
         device: Device of the noise.
         purpose: GENERATE, OUTPAINT or INPAINT.
+        ahead: Whether threads draw the next noise. None: if the device is a GPU.
     """
 
     def __init__(
@@ -187,16 +234,26 @@ class SceneNoise:
         shape: tuple[int, ...],
         device: torch.device | str,
         purpose: int = GENERATE,
+        ahead: bool | None = None,
     ) -> None:
         seeds = [seed] * len(indices) if isinstance(seed, int) else seed
         keys = [(index,) if isinstance(index, int) else index for index in indices]
         self.generators = [make_keyed_generator(one, *key, purpose) for one, key in zip(seeds, keys, strict=True)]
-        self.shape, self.device = shape, device
+        self.shape, self.device = shape, torch.device(device)
+        self.ahead = self.device.type == "cuda" if ahead is None else ahead
+        self.next = self._start() if self.ahead else None  # Noise of the next call.
 
     def draw(self) -> Float[Tensor, "b ..."]:
         """Return the next noise of all scenes, of shape (b, *shape)."""
-        noise = torch.stack([torch.randn(self.shape, generator=generator) for generator in self.generators])
-        return noise.to(self.device)
+        if self.next is None:
+            noise = torch.stack([torch.randn(self.shape, generator=generator) for generator in self.generators])
+            return noise.to(self.device)
+        noise = finish_drawing(*self.next, self.device)
+        self.next = self._start()
+        return noise
+
+    def _start(self) -> tuple[Tensor, list[Future]]:
+        return start_drawing(self.generators, self.shape, self.device)
 
 
 def make_keyed_generator(*key: int) -> torch.Generator:

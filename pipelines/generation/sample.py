@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import chain
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from models.labels import LABELS, compose_label, require_labels
 from models.layout import LayoutSpec
 from models.pipeline import PrITTIPipeline
+from models.sampling.execution import SamplingExecution
 from models.scene import Grid, Scene
 from models.tensors import resample_scene_ground
 from pipelines.editing.edit import Repair
@@ -72,6 +73,7 @@ class SampleRequest(Request):
         repair: Whether floating, sunken and overlapping primitives are moved; none are removed
             (pipelines/editing/edit.py).
         shard_scenes: Number of scenes per shard.
+        execution: How the model runs: precision, CUDA graphs, compilation and decoding.
     """
 
     num_scenes: int
@@ -84,6 +86,7 @@ class SampleRequest(Request):
     existence_threshold: float | None = None
     repair: bool = False
     shard_scenes: int = 64
+    execution: SamplingExecution = field(default_factory=SamplingExecution)
 
     def shards(self) -> list[Shard]:
         """Return all shards of the run."""
@@ -138,8 +141,11 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
     options["weights"] = f"{digest_weights(pipeline.lvae)}-{digest_weights(pipeline.dit)}"
     del options["model"]  # The model is identified by digests, because its directory may change.
     options.setdefault("existence_threshold", pipeline.config.existence_threshold)
-    if not options.get("repair"):  # Records written by earlier versions lack this option.
-        options.pop("repair", None)
+    if "execution" in options:
+        del options["execution"]["cuda_graphs"]  # CUDA graphs run the same kernels.
+    # Records written by earlier versions lack these options.
+    defaults = {"repair": False, "execution": {"precision": "fp32", "compile": False, "decode_batch_size": 1}}
+    options = {name: value for name, value in options.items() if name not in defaults or value != defaults[name]}
     # The sampler uses the noise scaling only if eta is not 1.
     if "repaint" in options and options["repaint"]["eta"] != 1:
         options["noise_scaling"] = pipeline.config.noise_scaling
@@ -211,6 +217,7 @@ class Sampler:
         self.request, self.batch_size = request, batch_size
         self.pipeline = load_pipeline(request.model)
         self.pipeline.use_sampler(request.sampler)
+        self.pipeline.set_execution(request.execution)
         self.repair = Repair(slab_offset_m=find_slab_offset_m(self.pipeline.spec.surface), drop=False)
 
     def __call__(self, row: dict) -> dict:

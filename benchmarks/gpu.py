@@ -1,0 +1,612 @@
+"""Measure sampling and training of the paper's networks on a GPU, without Ray and without a network.
+
+    python benchmarks/gpu.py --output DIR                          all sections, at most 8 minutes each
+    python benchmarks/gpu.py --output DIR --only latency train_dit
+    python benchmarks/gpu.py --output DIR --only learn --scenes town.safetensors      continues where it stopped
+    python benchmarks/gpu.py --output DIR --cpu                    rehearsal with tiny networks, a minute
+    python benchmarks/gpu.py --write-scenes town.safetensors       town scenes for train_lvae and learn
+
+The script needs models/ and its packages. Where this project is not installed, set PYTHONPATH=. in its root. Only
+--write-scenes also needs pipelines/.
+
+The sections:
+
+* latency: time of one scene (250 and 20 steps, batch 1) of DiT-B, L and XL, share of decoding, and peak memory
+* throughput: scenes per second for batches, and the share of the GPU's peak (MFU)
+* train_dit: time of a training step of DiT-B at batch 256, and MFU
+* train_lvae: time of a training step of the layout VAE at batch 32, share of matching, and MFU
+* precision: losses of 200 steps in bfloat16 and in float32, from the same weights, noise and data
+* learn: training of a layout VAE with the DETR decoder on town scenes
+
+Each section adds its rows to DIR/gpu.json and writes DIR/gpu.md. Weights are random except in `learn`. MFU divides the
+operations that torch counts by the time and by --peak-tflops (H100, bfloat16: 989).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.numpy import load_file, save_file
+
+from models.dit import DiT
+from models.layout import LayoutSpec
+from models.lvae import LayoutVAE
+from models.pipeline import PrITTIPipeline
+from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTConfig, DiTPreset, LVAEPreset
+from models.sampling.execution import SamplingExecution, require_bf16
+from models.training import (
+    ExecutionConfig,
+    OptimizerConfig,
+    Trainer,
+    count_flops,
+    make_dit_trainer,
+    make_lvae_trainer,
+)
+from models.vae import losses
+
+ROOT = Path(__file__).parents[1]
+SECTION_SECONDS = 480.0
+FIELDS = ("height", "occupied", "features", "real")
+MAX_SCENES_BYTES = 20_000_000
+DIT_NAMES = {"kitti360": "DiT-B", "kitti360-l": "DiT-L", "kitti360-xl": "DiT-XL"}
+# One scene of DiT-B with 250 steps.
+PAPER_LATENCY, TARGET_LATENCY, TARGET_MEMORY = "0.58 (A100)", "<= 0.15", "<= 0.6"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A measured value.
+
+    Attributes:
+        quantity: What was measured.
+        value: Value.
+        unit: Unit of the value.
+        target: Target with a comparison, such as "<= 0.15". Empty: none.
+        paper: Value of the paper. Empty: none.
+        note: Conditions.
+    """
+
+    quantity: str
+    value: float
+    unit: str
+    target: str = ""
+    paper: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Device, sizes and options of all sections.
+
+    Attributes:
+        device: Device.
+        tiny: Whether the networks and counts are tiny.
+        peak_tflops: Peak of the device for matrix products in bfloat16 (TFLOP/s).
+        output: Directory of results and checkpoints.
+        scenes: File of scenes. Empty: random layouts.
+        steps: Number of training steps of `learn`.
+    """
+
+    device: torch.device
+    tiny: bool
+    peak_tflops: float
+    output: Path
+    scenes: str
+    steps: int
+
+    def choose(self, full: int, tiny: int) -> int:
+        """Return a count for the full run or for the rehearsal."""
+        return tiny if self.tiny else full
+
+    def dit_preset(self, name: str) -> DiTPreset:
+        row = DIT_PRESETS[name]
+        return replace(row, model=DiTConfig(2, 2, 32, 2)) if self.tiny else row
+
+    def lvae_preset(self, name: str) -> LVAEPreset:
+        return LVAE_PRESETS["smoke" if self.tiny else name]
+
+    def spec(self, row: LVAEPreset) -> LayoutSpec:
+        return LayoutSpec().with_resolution(row.raster_px)
+
+    def make_lvae(self, name: str) -> LayoutVAE:
+        row = self.lvae_preset(name)
+        torch.manual_seed(0)
+        return LayoutVAE(layout=self.spec(row).to_dict(), **row.architecture())
+
+    def make_pipeline(self, name: str) -> PrITTIPipeline:
+        """Return a pipeline with random weights on the device; the encoders stay on the CPU."""
+        row = self.dit_preset(name)
+        lvae = self.make_lvae(row.lvae)
+        channels, size, _ = lvae.latent_shape
+        dit = DiT(**row.architecture(), channels=channels, size=size, layout=dict(lvae.config.layout))
+        for layer in (*dit.list_modulations(), dit.patch_out):  # They are zero at the start of a training.
+            torch.nn.init.normal_(layer.weight, std=0.02)
+        pipeline = PrITTIPipeline(lvae, dit)
+        pipeline.dit.to(self.device)
+        for decoder in (lvae.ground_decoder, lvae.object_decoder):
+            if decoder is not None:
+                decoder.to(self.device)
+        pipeline.set_progress_bar_config(disable=True)
+        return pipeline
+
+    def synchronise(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+
+    def time_call(self, call: Callable[[], object], repeats: int, warm_up: int = 2) -> float:
+        """Return the median wall-clock time of a call (s), with the work of the GPU."""
+        seconds = []
+        for k in range(warm_up + repeats):
+            self.synchronise()
+            started = time.perf_counter()
+            call()
+            self.synchronise()
+            if k >= warm_up:
+                seconds.append(time.perf_counter() - started)
+        return statistics.median(seconds)
+
+    def measure_mfu(self, operations: float, seconds: float) -> float:
+        """Return the share of the device's peak."""
+        return operations / seconds / (self.peak_tflops * 1e12)
+
+
+@contextmanager
+def measure_memory(setup: Setup, found: dict[str, float]) -> Iterator[None]:
+    """Store the peak of allocated GPU memory (GB), with the weights, under "peak_gb"; nothing on a CPU."""
+    if setup.device.type == "cuda":
+        torch.cuda.synchronize(setup.device)
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats(setup.device)
+    yield
+    if setup.device.type == "cuda":
+        found["peak_gb"] = torch.cuda.max_memory_allocated(setup.device) / 1e9
+
+
+# ------------------------------------------------------------------------------------------------------- sampling
+
+
+def measure_scene(setup: Setup, pipeline: PrITTIPipeline, steps: int) -> tuple[float, float]:
+    """Return the times of sampling and of decoding one scene (s)."""
+
+    def sample() -> torch.Tensor:
+        return pipeline.sample_latents(["low"], 0, [0], steps)
+
+    latents, identity = sample(), pipeline.new_identity("gpu", 0, 0, "low")
+    sampling = setup.time_call(sample, setup.choose(5, 2))
+    return sampling, setup.time_call(lambda: pipeline.decode(latents, [identity]), setup.choose(5, 2))
+
+
+def run_latency(setup: Setup) -> Iterator[Row]:
+    """Measure the time of one scene."""
+    main = "bfloat16, CUDA graph"
+    executions = {
+        "float32": SamplingExecution(),
+        "bfloat16": SamplingExecution("bf16"),
+        main: SamplingExecution("bf16", cuda_graphs=True),
+        f"{main}, compiled": SamplingExecution("bf16", cuda_graphs=True, compile=True),
+    }
+    if setup.tiny:
+        del executions[f"{main}, compiled"]  # Compiling takes longer than the rehearsal.
+    for name, label in DIT_NAMES.items():
+        for kind, execution in executions.items():
+            pipeline, memory = setup.make_pipeline(name), {}
+            pipeline.set_execution(execution)
+            with measure_memory(setup, memory):
+                for steps in (setup.choose(250, 10), setup.choose(20, 5)):
+                    sampling, decoding = measure_scene(setup, pipeline, steps)
+                    target, paper = "", ""
+                    if steps == 250 and name == "kitti360":
+                        target, paper = TARGET_LATENCY if main in kind else "", PAPER_LATENCY
+                    note = f"decoding {100 * decoding / (sampling + decoding):.0f} %"
+                    quantity = f"{label}, one scene, {steps} steps, {kind}"
+                    yield Row(quantity, sampling + decoding, "s", target, paper, note)
+            if memory:
+                target = TARGET_MEMORY if name == "kitti360" and kind == main else ""
+                note = "without encoders"
+                yield Row(f"{label}, peak memory, batch 1, {kind}", memory["peak_gb"], "GB", target, note=note)
+
+
+def count_denoising_step(setup: Setup, pipeline: PrITTIPipeline) -> float:
+    """Count the operations of a denoising step of one latent, with its modulations."""
+    latent = torch.zeros(1, *pipeline.latent_shape, device=setup.device)
+    ids = torch.zeros(1, dtype=torch.long, device=setup.device)
+    return count_flops(lambda: pipeline.dit(latent, ids, ids))
+
+
+@torch.no_grad()
+def run_throughput(setup: Setup) -> Iterator[Row]:
+    """Measure denoising steps of batches."""
+    for name, label in DIT_NAMES.items():
+        pipeline = setup.make_pipeline(name)
+        operations = count_denoising_step(setup, pipeline)
+        pipeline.set_execution(SamplingExecution("bf16", cuda_graphs=True))
+        for batch in (setup.choose(8, 2), setup.choose(32, 4), setup.choose(128, 8)):
+            timestep = torch.full((batch,), 500, device=setup.device)
+            classes = torch.zeros(batch, dtype=torch.long, device=setup.device)
+            latent = torch.randn(batch, *pipeline.latent_shape, device=setup.device)
+            denoise = pipeline.make_denoiser(torch.tensor([500]), classes)
+            seconds = setup.time_call(partial(denoise, latent, timestep, classes), setup.choose(20, 3), 3)
+            rate, mfu = batch / (250 * seconds), setup.measure_mfu(batch * operations, seconds)
+            yield Row(f"{label}, sampling, batch {batch}", rate, "scenes/s", note="250 steps, no decoding")
+            yield Row(f"{label}, MFU of a denoising step, batch {batch}", 100 * mfu, "%")
+
+
+# ------------------------------------------------------------------------------------------------------- training
+
+
+def load_scenes(path: str) -> dict[str, np.ndarray]:
+    """Read compact layouts (`tensors.encode_layout`) from a file of `write_scenes`; see there."""
+    stored = load_file(path)
+    shapes = json.loads(stored["shapes"].tobytes())
+    found = {}
+    for name in FIELDS:
+        kind, shape = shapes[name]
+        flat: np.ndarray = np.frombuffer(zlib.decompress(stored[name].tobytes()), np.dtype(kind))
+        if name == "occupied":
+            flat = np.unpackbits(flat.view(np.uint8), count=int(np.prod(shape))).astype(bool)
+        if name == "height":
+            flat = np.cumsum(flat.reshape(-1, shape[-1]), axis=1, dtype=np.uint16)
+        found[name] = flat.reshape(shape)
+    return found
+
+
+def write_scenes(path: Path, count: int) -> None:
+    """Write town scenes as compact layouts of the preset kitti360, compressed without loss, as safetensors.
+
+    Heights are stored as differences along the columns (modulo 65536), occupancy as bits.
+    """
+    from models.scene import Grid
+    from models.tensors import encode_layout
+    from pipelines.preprocess.sources.town.generator import generate_town
+
+    spec, rows = LayoutSpec(), []
+    for seed in range(-(-count // 16)):
+        drive = generate_town(1000 + seed)
+        poses = np.linspace(0, len(drive) - 1, min(16, count - len(rows))).astype(int)
+        rows += [encode_layout(drive.scene(int(k), "train", Grid()), spec) for k in poses]
+    arrays = {name: np.stack([row[name] for row in rows]) for name in FIELDS}
+    shapes = {name: [value.dtype.str, value.shape] for name, value in arrays.items()}
+    shapes["occupied"][0] = "|u1"
+    height = arrays["height"]
+    packed = arrays | {
+        "occupied": np.packbits(arrays["occupied"]),
+        "height": np.diff(height, axis=-1, prepend=np.zeros_like(height[..., :1])),
+    }
+    blobs = {name: np.frombuffer(zlib.compress(packed[name].tobytes(), 9), np.uint8) for name in FIELDS}
+    save_file(blobs | {"shapes": np.frombuffer(json.dumps(shapes).encode(), np.uint8)}, path)
+    size = path.stat().st_size
+    if size > MAX_SCENES_BYTES:
+        path.unlink()
+        raise ValueError(f"{count} scenes need {size:,} bytes, at most {MAX_SCENES_BYTES:,} travel; use --num-scenes")
+    print(f"{path}: {count} scenes, {size:,} bytes")
+
+
+class Layouts:
+    """Compact layouts from a file, or random ones.
+
+    Args:
+        setup: Options.
+        spec: Layout of the scenes. Layouts of a file must have it.
+    """
+
+    def __init__(self, setup: Setup, spec: LayoutSpec) -> None:
+        self.device = setup.device
+        if setup.scenes:
+            self.arrays = load_scenes(setup.scenes)
+            shape = self.arrays["height"].shape[-2:]
+            if shape != (spec.grid.rows, spec.grid.cols):
+                raise ValueError(f"{setup.scenes}: rasters of {shape} pixels, expected {spec.grid.rows}")
+            return
+        rng, count, slots = np.random.default_rng(0), 8, sum(spec.slots)
+        raster = (count, len(spec.ground_classes), spec.grid.rows, spec.grid.cols)
+        real = np.concatenate([np.arange(n) < rng.integers(0, 1 + n // 2) for n in spec.slots])
+        self.arrays = {
+            "height": rng.integers(0, 65536, raster, np.uint16),
+            "occupied": rng.random(raster) < 0.3,
+            "features": rng.random((count, slots, 9), np.float32) * real[:, None],
+            "real": np.tile(real, (count, 1)),
+        }
+
+    def __len__(self) -> int:
+        return len(self.arrays["real"])
+
+    def draw(self, step: int, batch: int) -> dict[str, torch.Tensor]:
+        """Return a batch of a step; every epoch has another order."""
+        first, order = step * batch, []
+        for place in range(first, first + batch):
+            epoch, k = divmod(place, len(self))
+            order.append(np.random.default_rng(epoch).permutation(len(self))[k])
+        return {name: torch.from_numpy(value[order]).to(self.device) for name, value in self.arrays.items()}
+
+
+def draw_posteriors(trainer: Trainer, batch: int, seed: int = 0) -> dict[str, torch.Tensor]:
+    """Return random posteriors and labels for a DiT."""
+    config, generator = trainer.model.config, torch.Generator().manual_seed(seed)
+    shape = batch, config.channels, config.size, config.size
+    arrays = {
+        "mean": torch.randn(shape, generator=generator),
+        "logvar": torch.full(shape, -8.0),
+        "label": torch.randint(config.num_labels, (batch,), generator=generator),
+    }
+    return {name: value.to(trainer.device) for name, value in arrays.items()}
+
+
+def make_dit_for_training(setup: Setup, precision: str, compiled: bool = False) -> Trainer:
+    row, shape = setup.dit_preset("kitti360"), setup.make_lvae("kitti360").latent_shape
+    torch.manual_seed(0)
+    dit = DiT(**row.architecture(), channels=shape[0], size=shape[1])
+    settings = OptimizerConfig(
+        row.steps, row.learning_rate, row.weight_decay, grad_clip=row.grad_clip, ema_decay=row.ema_decay
+    )
+    execution = ExecutionConfig(precision=precision, compile=compiled)
+    return make_dit_trainer(dit, settings, row.label_dropout, setup.device, execution=execution)
+
+
+def make_lvae_for_training(setup: Setup, precision: str, steps: int = 0, batch: dict | None = None) -> Trainer:
+    from models.batch import LayoutBatch
+
+    row, lvae = setup.lvae_preset("kitti360"), setup.make_lvae("kitti360")
+    lvae.to(setup.device)
+    if batch is not None:
+        lvae.init_from_data(LayoutBatch.from_compact(batch))
+    settings = OptimizerConfig(steps or row.steps, row.learning_rate, row.weight_decay, row.final_learning_rate)
+    return make_lvae_trainer(
+        lvae, settings, row.kl_weight, setup.device, execution=ExecutionConfig(precision=precision)
+    )
+
+
+def find_fitting_batch(batch: int, attempt: Callable[[int], object]) -> int:
+    """Return the largest of batch, batch / 2, ... for which `attempt` does not run out of memory.
+
+    Raises:
+        ValueError: Even one sample does not fit.
+    """
+    while batch:
+        try:
+            attempt(batch)
+        except torch.OutOfMemoryError:
+            torch.cuda.empty_cache()
+            batch //= 2
+        else:
+            return batch
+    raise ValueError("one sample does not fit in the memory of this GPU; use a smaller preset")
+
+
+def count_training_step(trainer: Trainer) -> float:
+    """Count the operations of the forward and backward pass of one latent."""
+    one = draw_posteriors(trainer, 1)
+    return count_flops(lambda: trainer.model(one["mean"], one["label"], one["label"]).square().mean().backward())
+
+
+def run_train_dit(setup: Setup) -> Iterator[Row]:
+    """Measure training steps of DiT-B."""
+    wanted = setup.choose(256, 4)
+    for compiled in (False,) if setup.tiny else (False, True):
+        trainer, memory = make_dit_for_training(setup, "bf16", compiled), {}
+
+        def step(arrays: dict[str, torch.Tensor], trainer: Trainer = trainer) -> None:
+            trainer.step(arrays, range(len(arrays["label"])))
+
+        def attempt(batch: int, trainer: Trainer = trainer) -> None:
+            trainer.step(draw_posteriors(trainer, batch), range(batch))
+
+        with measure_memory(setup, memory):
+            batch = find_fitting_batch(wanted, attempt)
+            seconds = setup.time_call(partial(step, draw_posteriors(trainer, batch)), setup.choose(10, 2))
+        mfu = setup.measure_mfu(batch * count_training_step(trainer), seconds)
+        note = ("compiled" if compiled else "not compiled") + describe_fit(wanted, batch)
+        yield Row(f"DiT-B, training step, batch {batch}, bfloat16", seconds, "s", note=note)
+        yield Row("DiT-B, MFU of training", 100 * mfu, "%", ">= 50", note=note)
+        if memory:
+            yield Row("DiT-B, peak memory of training", memory["peak_gb"], "GB", note=note)
+
+
+def describe_fit(wanted: int, batch: int) -> str:
+    """Return a note for a batch that is smaller than the wanted one."""
+    return f"; batch {wanted} does not fit in the memory, {batch} fits" if batch < wanted else ""
+
+
+def run_train_lvae(setup: Setup) -> Iterator[Row]:
+    """Measure training steps of the layout VAE and the share of matching."""
+    wanted, matching_s = setup.choose(32, 2), []
+    layouts = Layouts(setup, setup.spec(setup.lvae_preset("kitti360")))
+    trainer, memory = make_lvae_for_training(setup, "bf16"), {}
+    match = losses.match_primitives
+
+    def match_timed(*arguments):
+        setup.synchronise()
+        started = time.perf_counter()
+        found = match(*arguments)
+        matching_s.append(time.perf_counter() - started)
+        return found
+
+    with measure_memory(setup, memory):
+        batch = find_fitting_batch(wanted, lambda batch: trainer.step(layouts.draw(0, batch), range(batch)))
+        arrays = layouts.draw(0, batch)
+        seconds = setup.time_call(lambda: trainer.step(arrays, range(batch)), setup.choose(10, 2))
+        losses.match_primitives = match_timed
+        try:
+            setup.time_call(lambda: trainer.step(arrays, range(batch)), setup.choose(10, 2))
+        finally:
+            losses.match_primitives = match
+    operations = batch * count_flops(lambda: trainer.step({k: v[:1] for k, v in arrays.items()}, range(1)))
+    note = (Path(setup.scenes).name if setup.scenes else "random layouts") + describe_fit(wanted, batch)
+    share = 100 * statistics.median(matching_s) / seconds
+    yield Row(f"layout VAE, training step, batch {batch}, bfloat16", seconds, "s", note=note)
+    yield Row("layout VAE, share of matching", share, "%", "< 10", note=note)
+    yield Row("layout VAE, MFU of training", 100 * setup.measure_mfu(operations, seconds), "%", note=note)
+    if memory:
+        yield Row("layout VAE, peak memory of training", memory["peak_gb"], "GB", note=note)
+
+
+def run_precision(setup: Setup) -> Iterator[Row]:
+    """Compare the losses of trainings in bfloat16 and in float32."""
+    steps, last = setup.choose(200, 6), setup.choose(50, 3)
+    layouts = Layouts(setup, setup.spec(setup.lvae_preset("kitti360")))
+    sizes = {"DiT-B": setup.choose(32, 2), "layout VAE": setup.choose(8, 2)}
+    for name, batch in sizes.items():
+        curves = {}
+        for precision in ("fp32", "bf16"):
+            if name == "DiT-B":
+                trainer = make_dit_for_training(setup, precision)
+                arrays = [draw_posteriors(trainer, batch, seed=k) for k in range(8)]
+            else:
+                trainer = make_lvae_for_training(setup, precision)
+                arrays = [layouts.draw(k, batch) for k in range(8)]
+            curve = [trainer.step(arrays[k % 8], range(batch))["loss"] for k in range(steps)]
+            curves[precision] = torch.stack(curve).float().cpu().numpy()
+        ratio = curves["bf16"] / curves["fp32"]
+        yield Row(
+            f"{name}, loss in bfloat16 divided by loss in float32, last {last} of {steps} steps",
+            float(curves["bf16"][-last:].mean() / curves["fp32"][-last:].mean()),
+            "",
+            note=f"single steps {ratio.min():.3f} to {ratio.max():.3f}; batch {batch}",
+        )
+
+
+def run_learn(setup: Setup) -> Iterator[Row]:
+    """Train a layout VAE on the scenes for at most SECTION_SECONDS, from the last checkpoint."""
+    if not setup.scenes and not setup.tiny:
+        raise ValueError("learn needs --scenes FILE; make it with --write-scenes FILE")
+    row = setup.lvae_preset("kitti360")
+    layouts, steps, batch = Layouts(setup, setup.spec(row)), setup.choose(setup.steps, 4), setup.choose(32, 2)
+    trainer = make_lvae_for_training(setup, "auto", steps, layouts.draw(0, min(64, len(layouts))))
+    folder = setup.output / "learn"
+    if (folder / "state.json").exists():
+        trainer.load(folder)
+    first, started, curve = trainer.steps_done, time.monotonic(), []
+    while trainer.steps_done < steps and time.monotonic() - started < SECTION_SECONDS - 60:
+        found = trainer.step(layouts.draw(trainer.steps_done, batch), range(batch))
+        if trainer.steps_done % 50 == 0 or trainer.steps_done == steps:
+            curve.append((trainer.steps_done, {name: float(value) for name, value in found.items()}))
+            print(f"  step {trainer.steps_done}: loss {curve[-1][1]['loss']:.4f}", flush=True)
+    trainer.save(folder)
+    trainer.model.save_pretrained(folder / "model")
+    with (folder / "curve.jsonl").open("a") as stream:
+        for step, values in curve:
+            stream.write(json.dumps({"step": step} | values) + "\n")
+    seconds = time.monotonic() - started
+    done = trainer.steps_done - first
+    for name in ("loss", "center", "cholesky", "existence", "occupancy"):
+        if curve:
+            yield Row(f"learn, {name} after {trainer.steps_done} steps", curve[-1][1][name], "")
+    if done:
+        yield Row(
+            "learn, scenes per second",
+            done * batch / seconds,
+            "scenes/s",
+            note=f"steps {first} to {trainer.steps_done}",
+        )
+
+
+# -------------------------------------------------------------------------------------------------------- results
+
+SECTIONS: dict[str, Callable[[Setup], Iterator[Row]]] = {
+    "latency": run_latency,
+    "throughput": run_throughput,
+    "train_dit": run_train_dit,
+    "train_lvae": run_train_lvae,
+    "precision": run_precision,
+    "learn": run_learn,
+}
+
+
+def describe_device(device: torch.device) -> str:
+    """Return device, driver, versions and commit in one line."""
+    name = platform.processor() or platform.machine()
+    if device.type == "cuda":
+        free, total = torch.cuda.mem_get_info(device)
+        name = f"{torch.cuda.get_device_name(device)}, {total / 2**30:.0f} GiB ({free / 2**30:.0f} free)"
+        with suppress(OSError, subprocess.CalledProcessError):
+            command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+            name += f", driver {subprocess.check_output(command, text=True).split()[0]}"
+    commit = os.environ.get("COMMIT", "")
+    with suppress(OSError, subprocess.CalledProcessError):
+        command = ["git", "-C", str(ROOT), "rev-parse", "--short=10", "HEAD"]
+        commit = subprocess.check_output(command, text=True, stderr=subprocess.DEVNULL).strip()
+    return f"{name}, torch {torch.__version__}, CUDA {torch.version.cuda}, Python {platform.python_version()}, {commit}"
+
+
+def format_table(results: dict) -> str:
+    """Return the rows of all sections as a Markdown table."""
+    lines = ["| quantity | value | target | paper | conditions |", "|---" * 5 + "|"]
+    for section in results.values():
+        for row in section["rows"]:
+            value = f"{row['value']:.4g} {row['unit']}".strip()
+            lines.append(f"| {row['quantity']} | {value} | {row['target']} | {row['paper']} | {row['note']} |")
+    machines = sorted({section["machine"] for section in results.values()})
+    return "\n".join([*lines, "", *machines, ""])
+
+
+def run_sections(setup: Setup, names: list[str]) -> int:
+    """Run sections and merge their rows with those of earlier runs; return the number of failed sections."""
+    path, failed = setup.output / "gpu.json", 0
+    setup.output.mkdir(parents=True, exist_ok=True)
+    results = json.loads(path.read_text()) if path.exists() else {}
+    for name in names:
+        started, rows = time.monotonic(), []
+        print(f"{name}:", flush=True)
+        try:
+            for row in SECTIONS[name](setup):
+                if setup.tiny:
+                    row = replace(row, quantity=f"tiny {row.quantity}", target="", paper="")
+                rows.append(vars(row))
+                print(f"  {row.quantity}: {row.value:.4g} {row.unit} {row.note}", flush=True)
+        except (ValueError, RuntimeError) as error:  # The other sections still run.
+            failed += 1
+            print(f"error: {name}: {error}", file=sys.stderr, flush=True)
+        if rows:
+            seconds = time.monotonic() - started
+            results[name] = {"machine": describe_device(setup.device), "seconds": round(seconds, 1), "rows": rows}
+        results = {section: results[section] for section in SECTIONS if section in results}
+        path.write_text(json.dumps(results, indent=1) + "\n")
+        (setup.output / "gpu.md").write_text(format_table(results))
+    return failed
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=Path("gpu"), help="directory of results (default: gpu)")
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), help="sections to run")
+    parser.add_argument("--scenes", default="", help="file of --write-scenes (default: random layouts)")
+    parser.add_argument("--steps", type=int, default=20_000, help="training steps of learn (default: 20000)")
+    parser.add_argument("--peak-tflops", type=float, default=989.0, help="peak in bfloat16 (default: 989, H100)")
+    parser.add_argument("--cpu", action="store_true", help="rehearse with tiny networks on the CPU")
+    parser.add_argument("--write-scenes", type=Path, metavar="FILE", help="write town scenes to this file, and end")
+    parser.add_argument("--num-scenes", type=int, default=256, help="number of scenes to write (default: 256)")
+    options = parser.parse_args()
+    if options.write_scenes:
+        write_scenes(options.write_scenes, options.num_scenes)
+        return 0
+    if not options.cpu and not torch.cuda.is_available():
+        print("error: torch finds no GPU; check nvidia-smi and the driver, or rehearse with --cpu", file=sys.stderr)
+        return 2
+    device = torch.device("cpu" if options.cpu else "cuda")
+    require_bf16(device)
+    setup = Setup(device, options.cpu, options.peak_tflops, options.output, options.scenes, options.steps)
+    failed = run_sections(setup, options.only)
+    print(f"{options.output}/gpu.md")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

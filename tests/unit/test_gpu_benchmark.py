@@ -1,0 +1,114 @@
+"""Tests of benchmarks/gpu.py: the rehearsal without Ray and without a network, and the file of scenes."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from helpers import ROOT
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+import gpu
+
+from models.layout import LayoutSpec
+from models.scene import Grid
+from models.tensors import encode_layout
+from pipelines.preprocess.sources.town.generator import generate_town
+
+# Neither Ray nor the packages of pipelines/ and jobs/ can be imported, and no connection can be opened.
+ISOLATED = """
+import runpy, socket, sys
+for name in ("ray", "pipelines", "jobs", "pyarrow", "mlflow", "tyro"):
+    sys.modules[name] = None
+def refuse(*_):
+    raise OSError("no network")
+socket.socket.connect = refuse
+sys.argv = ["gpu.py", *sys.argv[1:]]
+runpy.run_path("benchmarks/gpu.py", run_name="__main__")
+"""
+
+
+def run_isolated(*words: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-c", ISOLATED, *words]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+
+def test_rehearsal_needs_only_models_and_sections_merge(tmp_path):
+    done = run_isolated("--cpu", "--output", str(tmp_path))
+    assert done.returncode == 0, done.stderr[-3000:]
+    results = json.loads((tmp_path / "gpu.json").read_text())
+    assert list(results) == list(gpu.SECTIONS) and all(section["rows"] for section in results.values())
+    values = [row["value"] for section in results.values() for row in section["rows"]]
+    assert np.isfinite(values).all() and min(values) > 0
+    assert (tmp_path / "learn/model/config.json").exists()
+    learned = json.loads((tmp_path / "learn/state.json").read_text())["steps_done"]
+    again = run_isolated("--cpu", "--output", str(tmp_path), "--only", "train_dit", "learn")
+    assert again.returncode == 0, again.stderr[-3000:]
+    merged = json.loads((tmp_path / "gpu.json").read_text())
+    assert {name: merged[name] for name in ("latency", "precision")} == {
+        n: results[n] for n in ("latency", "precision")
+    }
+    assert json.loads((tmp_path / "learn/state.json").read_text())["steps_done"] == learned  # All steps were done.
+    table = (tmp_path / "gpu.md").read_text()
+    rows = sum(len(section["rows"]) for section in merged.values())
+    assert table.count("\n| tiny ") == rows
+
+
+def test_without_gpu_the_error_says_what_to_do(tmp_path):
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    done = run_isolated("--output", str(tmp_path / "none"))
+    assert done.returncode == 2 and "error: torch finds no GPU; check nvidia-smi" in done.stderr
+    assert not (tmp_path / "none").exists()
+
+
+def test_scenes_travel_without_loss_and_are_small(tmp_path):
+    path = tmp_path / "town.safetensors"
+    gpu.write_scenes(path, 6)
+    arrays, drive = gpu.load_scenes(str(path)), generate_town(1000)
+    for k, pose in enumerate(np.linspace(0, len(drive) - 1, 6).astype(int)):
+        expected = encode_layout(drive.scene(int(pose), "train", Grid()), LayoutSpec())
+        for name in gpu.FIELDS:
+            assert arrays[name].dtype == expected[name].dtype and np.array_equal(arrays[name][k], expected[name])
+    assert path.stat().st_size / 6 * 256 < gpu.MAX_SCENES_BYTES
+
+
+def test_scenes_that_are_too_large_are_not_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(gpu, "MAX_SCENES_BYTES", 1000)
+    with pytest.raises(ValueError, match=r"2 scenes need .* bytes, at most 1,000 travel; use --num-scenes"):
+        gpu.write_scenes(tmp_path / "town.safetensors", 2)
+    assert not list(tmp_path.iterdir())
+
+
+def test_batch_that_fits_is_found():
+    tried = []
+
+    def attempt(batch: int) -> None:
+        tried.append(batch)
+        if batch > 32:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+
+    assert gpu.find_fitting_batch(256, attempt) == 32 and tried == [256, 128, 64, 32]
+    assert gpu.describe_fit(256, 32) == "; batch 256 does not fit in the memory, 32 fits"
+
+    def fail(batch: int) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    with pytest.raises(ValueError, match="one sample does not fit"):
+        gpu.find_fitting_batch(4, fail)
+
+
+def test_failed_section_does_not_stop_the_others(tmp_path, monkeypatch, capsys):
+    def fail(setup):
+        yield gpu.Row("first", 1.0, "s")
+        raise RuntimeError("CUDA error: an illegal memory access")
+
+    monkeypatch.setitem(gpu.SECTIONS, "latency", fail)
+    monkeypatch.setitem(gpu.SECTIONS, "throughput", lambda setup: iter([gpu.Row("second", 2.0, "s", "<= 3")]))
+    setup = gpu.Setup(torch.device("cpu"), False, 989.0, tmp_path, "", 1)
+    assert gpu.run_sections(setup, ["latency", "throughput"]) == 1
+    assert "error: latency: CUDA error" in capsys.readouterr().err
+    table = (tmp_path / "gpu.md").read_text()
+    assert "| first | 1 s |" in table and "| second | 2 s | <= 3 |" in table
