@@ -44,7 +44,7 @@ class Config:
     (default: train all parts)."""
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
-    min_workers: int = 0
+    min_workers: int | None = None
     """Number of workers with which training continues if nodes are lost; it grows again to --num-workers when nodes
     return (default: --num-workers)."""
     gpus: GpusOption = None

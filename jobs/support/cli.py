@@ -6,6 +6,7 @@ import importlib
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
 from inspect import get_annotations
@@ -14,7 +15,7 @@ from typing import Annotated, get_type_hints
 
 import tyro
 
-from jobs.support.log import use_log_format
+from jobs.support.log import JsonLines, use_log_format
 from jobs.support.renames import find_renamed
 
 # Environment variables that Ray reads at import and at start. Variables that the user has set keep their values.
@@ -197,6 +198,9 @@ def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) ->
             cause = find_root_cause(error)
             if isinstance(cause, (ValueError, OSError)):
                 exit_with_error(str(cause).split("\nFailed to apply UDF transform", 1)[0])  # without Ray's advice
+            if isinstance(sys.stderr, JsonLines):
+                sys.stderr.write(traceback.format_exc())
+                sys.exit(1)
             raise
 
 

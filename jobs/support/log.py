@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
+
+TRACEBACK = "Traceback (most recent call last):"
+ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")  # Colours of terminals.
 
 
 class JsonLines:
@@ -19,10 +23,15 @@ class JsonLines:
         self._rest = ""
 
     def write(self, text: str) -> int:
+        text_ended = text.endswith("\n") and not self._rest
+        if TRACEBACK in text and text_ended:  # One object, which contains the whole traceback.
+            trace = ANSI.sub("", text).strip()
+            self.write_event(trace.rsplit("\n", 1)[-1], {"level": "error", "traceback": trace})
+            return len(text)
         *lines, self._rest = (self._rest + text).split("\n")
         for line in lines:
             if line.strip():
-                self.write_event(line.rstrip("\r"), {})
+                self.write_event(ANSI.sub("", line.rstrip("\r")), {})
         return len(text)
 
     def write_event(self, message: str, values: dict[str, Any]) -> None:

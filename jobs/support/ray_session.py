@@ -25,7 +25,9 @@ def start_ray(training: bool = False, object_store_bytes: int | None = None) -> 
     if ray.is_initialized():
         return
     store: dict[str, Any] = {} if os.environ.get("RAY_ADDRESS") else {"object_store_memory": object_store_bytes}
-    ray.init(logging_level=logging.WARNING, log_to_driver=True, include_dashboard=training, **store)
+    # Without RAY_ADDRESS, Ray would join any cluster that somebody has started on this machine.
+    address = os.environ.get("RAY_ADDRESS") or "local"
+    ray.init(address, logging_level=logging.WARNING, log_to_driver=True, include_dashboard=training, **store)
     context = ray.data.DataContext.get_current()
     context.enable_progress_bars = False
     context.print_on_execution_start = False

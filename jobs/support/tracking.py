@@ -38,16 +38,46 @@ def hide_credentials(uri: str) -> str:
     return re.sub(r"//[^/@]*@", "//", uri)
 
 
-def make_artifact_location() -> str:
-    """Return the directory of artifacts under $PRITTI_HOME.
+def find_artifact_settings() -> dict[str, str]:
+    """Return the variables that MLflow and boto3 need to write artifacts to the storage of $PRITTI_HOME.
 
-    MLflow knows no options of URIs. It reads an endpoint from $MLFLOW_S3_ENDPOINT_URL, which this function sets.
+    MLflow knows no options of URIs, so the options become variables. Variables that the user has set have precedence.
+    Credentials are left out.
     """
     base, options = split_options(home_path("mlartifacts"))
     found = parse_s3_options(options.lstrip("?")) if base.startswith("s3://") else {}
+    settings = {}
     if endpoint := found.get("endpoint_override"):
-        os.environ.setdefault("MLFLOW_S3_ENDPOINT_URL", f"{found.get('scheme', 'https')}://{endpoint}")
-    return base
+        settings["MLFLOW_S3_ENDPOINT_URL"] = f"{found.get('scheme', 'https')}://{endpoint}"
+    if region := found.get("region"):
+        settings["AWS_DEFAULT_REGION"] = region
+    names = ("MLFLOW_S3_ENDPOINT_URL", "MLFLOW_S3_IGNORE_TLS", "AWS_ENDPOINT_URL", "AWS_DEFAULT_REGION")
+    return settings | {name: os.environ[name] for name in names if os.environ.get(name)}
+
+
+@contextmanager
+def explain_errors(uri: str) -> Iterator[None]:
+    """Convert errors of MLflow and of its storage to one line with the remedy.
+
+    Args:
+        uri: Tracking URI.
+
+    Yields:
+        None.
+
+    Raises:
+        OSError: MLflow or the storage of its artifacts cannot be used.
+    """
+    try:
+        yield
+    except (ValueError, OSError):
+        raise
+    except Exception as error:
+        reason = str(error).split("\n", 1)[0]
+        raise OSError(
+            f"MLflow ({hide_credentials(uri)}) or the storage of its artifacts cannot be used ({type(error).__name__}:"
+            f" {reason}); check MLFLOW_TRACKING_URI, MLFLOW_S3_ENDPOINT_URL and the keys, then run the same command again"
+        ) from error
 
 
 def make_client(uri: str):
@@ -105,8 +135,8 @@ def close_dead_runs(api: Any, experiment_id: str) -> None:
 class Tracker:
     """Write to one MLflow run. A tracker can be pickled, because each process opens its own client."""
 
-    def __init__(self, uri: str, run_id: str) -> None:
-        self.uri, self.run_id = uri, run_id
+    def __init__(self, uri: str, run_id: str, settings: dict[str, str] | None = None) -> None:
+        self.uri, self.run_id, self.settings = uri, run_id, settings or {}
         self._client = None
 
     def __getstate__(self) -> dict:
@@ -114,8 +144,11 @@ class Tracker:
 
     @property
     def client(self):
-        """MLflow client of this process."""
-        self._client = self._client or make_client(self.uri)
+        """MLflow client of this process. Workers do not have the driver's variables, so the tracker sets them."""
+        if self._client is None:
+            for name, value in self.settings.items():
+                os.environ.setdefault(name, value)
+            self._client = make_client(self.uri)
         return self._client
 
     @classmethod
@@ -137,6 +170,9 @@ class Tracker:
         uri = find_tracking_uri()
         if uri.startswith("sqlite:///"):
             Path(uri.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
+        settings = find_artifact_settings()
+        for name, value in settings.items():
+            os.environ.setdefault(name, value)
         api = make_client(uri)
         if (found := api.get_experiment_by_name(experiment)) is not None:
             close_dead_runs(api, found.experiment_id)
@@ -144,9 +180,9 @@ class Tracker:
         if hide_credentials(known["tracking_uri"]) == hide_credentials(uri):
             api.update_run(known["run_id"], status="RUNNING")
             api.set_tag(known["run_id"], OWNER, json.dumps(describe_owner()))
-            return cls(uri, known["run_id"])
+            return cls(uri, known["run_id"], settings)
         if found is None:
-            artifacts = make_artifact_location() if uri.startswith("sqlite:") else None
+            artifacts = split_options(home_path("mlartifacts"))[0] if uri.startswith("sqlite:") else None
             experiment_id = api.create_experiment(experiment, artifact_location=artifacts)
         else:
             experiment_id = found.experiment_id
@@ -164,7 +200,7 @@ class Tracker:
             api.set_tag(run_id, key, value)
         if record:
             storage.write_json({"tracking_uri": hide_credentials(uri), "run_id": run_id}, record)
-        return cls(uri, run_id)
+        return cls(uri, run_id, settings)
 
     @contextmanager
     def end_on_error(self) -> Iterator[Tracker]:
@@ -184,19 +220,23 @@ class Tracker:
         from mlflow.entities import Metric  # imported after `client` has set MLflow's environment variables
 
         now = int(time.time() * 1000)
-        self.client.log_batch(self.run_id, metrics=[Metric(k, float(v), now, step) for k, v in values.items()])
+        with explain_errors(self.uri):
+            self.client.log_batch(self.run_id, metrics=[Metric(k, float(v), now, step) for k, v in values.items()])
 
     def tag(self, key: str, value: str) -> None:
         """Set a tag of the run."""
-        self.client.set_tag(self.run_id, key, value)
+        with explain_errors(self.uri):
+            self.client.set_tag(self.run_id, key, value)
 
     def picture(self, image, path: str) -> None:
         """Log a picture (H, W, 3) uint8 as an artifact."""
-        self.client.log_image(self.run_id, Image.fromarray(image), artifact_file=path)
+        with explain_errors(self.uri):
+            self.client.log_image(self.run_id, Image.fromarray(image), artifact_file=path)
 
     def artifacts(self, directory: str, path: str) -> None:
         """Log the files of a directory as artifacts under `path`."""
-        self.client.log_artifacts(self.run_id, directory, path)
+        with explain_errors(self.uri):
+            self.client.log_artifacts(self.run_id, directory, path)
 
     def history(self, name: str) -> list[tuple[int, float]]:
         """Return (step, value) of a metric, ordered by step.

@@ -205,13 +205,13 @@ def tag_weights(tracker: Tracker, model: torch.nn.Module, steps: int) -> None:
     tracker.tag("steps", str(steps))
 
 
-def fit(run: TrainingRun, num_workers: int, output: str, min_workers: int = 0) -> str:
+def fit(run: TrainingRun, num_workers: int, output: str, min_workers: int | None = None) -> str:
     """Train until the last step, and write the model to a directory.
 
     Args:
         run: Training run.
         num_workers: Maximum number of Ray Train workers.
-        min_workers: Number of workers with which the training continues if nodes are lost. 0: `num_workers`.
+        min_workers: Number of workers with which the training continues if nodes are lost. None: `num_workers`.
         output: Directory or URI for the model. The model has the EMA weights if EMA is enabled.
 
     Returns:
@@ -222,7 +222,8 @@ def fit(run: TrainingRun, num_workers: int, output: str, min_workers: int = 0) -
     """
     start_ray(training=True)
     try:
-        scaling = make_scaling_config(num_workers, min_workers or num_workers, run.stream.batch_size)
+        least = num_workers if min_workers is None else min_workers
+        scaling = make_scaling_config(num_workers, least, run.stream.batch_size)
         with JobProgress() as bar:
             bar.follow(run.name, run.settings.steps, partial(read_step, run))
             result = fit_with_retries(run, scaling)
@@ -237,8 +238,8 @@ def fit(run: TrainingRun, num_workers: int, output: str, min_workers: int = 0) -
     except Exception as error:
         run.tracker.finish("FAILED")
         for failure in getattr(error, "worker_failures", {}).values():
-            if isinstance(find_root_cause(failure), ValueError):
-                raise find_root_cause(failure) from error
+            if isinstance(cause := find_root_cause(failure), (ValueError, OSError)):
+                raise cause from error
         raise
     run.tracker.finish("FINISHED")
     return output

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Collection
+from contextlib import suppress
 from typing import Any
 
 import ray
@@ -47,7 +48,8 @@ def require_shared_storage(output: str, checked: Collection[str] = ()) -> set[st
     finally:
         # The tasks are not cancelled: if a task ends in the same moment, `ray.cancel` ends the driver (Ray 2.60).
         for marker in markers.values():
-            storage.delete_file(marker)
+            with suppress(OSError):  # Where nothing can be written, an error here would hide the first one.
+                storage.delete_file(marker)
     return set(alive)
 
 

@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from models.limits import LimitError, find_limit, require_within
 from models.strict_json import parse_json
-from models.uris import OBJECT_STORES, connect_fsspec, join_uri, resolve_uri, split_name
+from models.uris import OBJECT_STORES, connect_fsspec, is_uri, join_uri, resolve_uri, split_name
 from pipelines.runtime.machines import identify_machine, is_process_alive
 from pipelines.runtime.parquet_sizes import ITEM_BYTES, measure_columns
 from pipelines.runtime.remote_file import RemoteFile
@@ -209,10 +209,10 @@ def create_file(uri: str, content: bytes) -> bool:
 
 def _make_write_error(uri: str, error: OSError) -> OSError:
     reason = os.strerror(error.errno) if error.errno else str(error)
-    return OSError(
-        f"{uri}: cannot be written ({reason}); free disk space or give write permission, then run the same command"
-        " again"
-    )
+    remedy = "free disk space or give write permission"
+    if is_uri(uri):
+        remedy = "check that the bucket exists, and check the keys, the region and the endpoint"
+    return OSError(f"{uri}: cannot be written ({reason}); {remedy}, then run the same command again")
 
 
 def find_time_ns(uri: str) -> int:

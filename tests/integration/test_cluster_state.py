@@ -52,6 +52,19 @@ def test_retries_running_tasks_and_waiting_actors_are_listed(cluster, tmp_path):
     wait_until(lambda: "1 Giant" not in list_waiting())
 
 
+@pytest.mark.parametrize(("given", "expected"), [("", "local"), ("127.0.0.1:6379", "127.0.0.1:6379")])
+def test_job_joins_a_cluster_only_if_its_address_is_given(monkeypatch, given, expected):
+    """By default, Ray joins any cluster that somebody has started on this machine."""
+    from jobs.support.ray_session import start_ray
+
+    found = []
+    monkeypatch.setenv("RAY_ADDRESS", given)
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray, "init", lambda address=None, **_: found.append(address))
+    start_ray()
+    assert found == [expected]
+
+
 def test_more_actors_than_the_cluster_has_room_for_do_not_hang(cluster):
     class Double:
         def __call__(self, row: dict) -> dict:

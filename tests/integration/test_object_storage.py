@@ -228,6 +228,50 @@ def test_refused_write_is_one_clear_error(s3, uri, message, monkeypatch):
         s3.intercept = lambda method, path: 0
 
 
+def test_node_without_keys_is_one_clear_error(s3):
+    """Neither the marker of the node nor its deletion is allowed."""
+    from pipelines.runtime.shared_storage import require_shared_storage
+
+    s3.intercept = lambda method, path: 403
+    try:
+        with pytest.raises(
+            ValueError, match=r"node \S+ \(.*\): s3://tests/x/.*cannot be written .*; check that the buck"
+        ):
+            require_shared_storage(s3.uri("x"))
+    finally:
+        s3.intercept = lambda method, path: 0
+
+
+def test_workers_send_artifacts_to_the_endpoint_of_the_home(s3, tmp_path, monkeypatch):
+    """Ray's workers do not have the variables that the driver sets."""
+    import numpy as np
+    import ray
+
+    from jobs.support.tracking import Tracker
+
+    monkeypatch.setenv("PRITTI_HOME", s3.uri("home"))
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlflow.db")
+    for name in ("MLFLOW_S3_ENDPOINT_URL", "AWS_DEFAULT_REGION", "AWS_ENDPOINT_URL"):
+        monkeypatch.delenv(name, raising=False)
+
+    @ray.remote
+    def log_picture(tracker: Tracker, name: str) -> None:
+        tracker.picture(np.zeros((8, 8, 3), np.uint8), name)
+
+    for name in ("new.png", "again.png"):  # The second run finds the experiment.
+        monkeypatch.delenv("MLFLOW_S3_ENDPOINT_URL", raising=False)
+        tracker = Tracker.start("pictures", name, {})
+        s3.requests.clear()
+        ray.get(log_picture.remote(tracker, name))
+        assert [path for path in s3.list_writes() if path.endswith(name) and "/home/mlartifacts/" in path]
+        assert "testing" not in json.dumps(tracker.settings)  # no keys
+    with pytest.raises(
+        OSError, match=r"^MLflow \(sqlite:.*\) or the storage .* \(KeyError: 'gone'\); check MLFLOW_TRA"
+    ):
+        monkeypatch.setattr(type(tracker.client), "set_tag", lambda *_: {}["gone"])
+        tracker.tag("key", "value")
+
+
 @pytest.mark.slow  # The connection times out after half a minute.
 def test_hung_endpoint_ends_with_an_error(s3):
     with socket.create_server(("127.0.0.1", 0)) as server:

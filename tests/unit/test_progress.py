@@ -4,6 +4,7 @@ import io
 import json
 import sys
 import time
+import traceback
 
 import pytest
 
@@ -86,6 +87,21 @@ def test_json_lines_hold_every_printed_line(monkeypatch):
     (error,) = map(json.loads, errors.getvalue().splitlines())
     assert error["level"] == "error" and error["message"] == "error: no such file"
     assert sys.stdout is out and not isinstance(sys.stdout, JsonLines)
+
+
+def test_traceback_is_one_json_object_without_colours(monkeypatch):
+    errors = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", errors)
+    with use_log_format("json"):
+        try:
+            raise KeyError("gone")
+        except KeyError:
+            sys.stderr.write(traceback.format_exc())
+        print("\x1b[36m(worker pid=1)\x1b[0m ready", file=sys.stderr)
+    error, line = map(json.loads, errors.getvalue().splitlines())
+    assert error["level"] == "error" and error["message"] == "KeyError: 'gone'"
+    assert error["traceback"].startswith("Traceback (most recent call last)") and "test_progress" in error["traceback"]
+    assert line["level"] == "warning" and line["message"] == "(worker pid=1) ready"
 
 
 @pytest.mark.parametrize(
