@@ -76,7 +76,7 @@ def explain_errors(uri: str) -> Iterator[None]:
         reason = str(error).split("\n", 1)[0]
         raise OSError(
             f"MLflow ({hide_credentials(uri)}) or the storage of its artifacts cannot be used ({type(error).__name__}:"
-            f" {reason}); check MLFLOW_TRACKING_URI, MLFLOW_S3_ENDPOINT_URL and the keys, then run the same command again"
+            f" {reason}); check MLFLOW_TRACKING_URI, MLFLOW_S3_ENDPOINT_URL and the keys, then run the command again"
         ) from error
 
 
