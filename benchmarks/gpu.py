@@ -44,11 +44,11 @@ import torch
 from safetensors.numpy import load_file, save_file
 
 from models.dit import DiT
+from models.execution import SamplingExecution, require_bf16
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTConfig, DiTPreset, LVAEPreset
-from models.sampling.execution import SamplingExecution, require_bf16
 from models.training import (
     ExecutionConfig,
     OptimizerConfig,

@@ -22,6 +22,7 @@ from models.composition.generator import StepCallback
 from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
 from models.composition.outpaint import BlockIndex, outpaint_scene
 from models.dit import DiT
+from models.execution import SamplingExecution
 from models.labels import find_label_index, split_label
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
@@ -42,7 +43,6 @@ from models.sampling.diffusion import (
     scale_noise,
     with_guidance,
 )
-from models.sampling.execution import SamplingExecution
 from models.sampling.repaint import NUM_INFERENCE_STEPS, RePaintConfig
 from models.sampling.schedulers import SchedulerConfig
 from models.scene import Scene

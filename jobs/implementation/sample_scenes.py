@@ -10,8 +10,8 @@ from jobs.support.cli import resolve_path
 from jobs.support.model_directories import find_pipeline_directory, read_label_kind
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
+from models.execution import SamplingExecution
 from models.labels import LABELS
-from models.sampling.execution import SamplingExecution
 from pipelines.generation.sample import SampleRequest, sample_scenes
 from pipelines.io.mesh_export import export_glb
 from pipelines.runtime import storage

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from models.execution import SamplingExecution
 from models.labels import LABELS, compose_label, require_labels
 from models.layout import LayoutSpec
 from models.pipeline import PrITTIPipeline
-from models.sampling.execution import SamplingExecution
 from models.scene import Grid, Scene
 from models.tensors import resample_scene_ground
 from pipelines.editing.edit import Repair
