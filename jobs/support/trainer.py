@@ -9,7 +9,7 @@ import logging
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
@@ -105,6 +105,8 @@ def train_worker(run: TrainingRun) -> None:
             losses = trainer.step(convert_to_tensors(batch), positions, weight)
         except NonFiniteLossError as error:
             raise ValueError(with_scene_ids(error, run.stream)) from error
+        except torch.OutOfMemoryError as error:
+            raise ValueError(describe_fitting_batch(trainer, batch, positions, world)) from error
         step, last = trainer.steps_done, trainer.steps_done == run.settings.steps
         if rank == 0 and (last or time.perf_counter() - told > TELL_S):
             write_step(run, step)
@@ -130,6 +132,34 @@ def train_worker(run: TrainingRun) -> None:
             saved = is_lost
             report(run, trainer, rank, float(losses["loss"]))
             started, logged, waited = time.perf_counter(), step, 0.0
+
+
+def describe_fitting_batch(trainer: Trainer, batch: dict[str, np.ndarray], positions: Sequence[int], world: int) -> str:
+    """Find out with how many accumulated parts a batch fits into the memory of the GPU.
+
+    Args:
+        trainer: Trainer whose step ran out of memory. It cannot be used afterwards.
+        batch: Batch of this worker.
+        positions: Positions of its samples in the global batch.
+        world: Number of workers. With several workers, smaller parts are not tried, because the others would wait.
+
+    Returns:
+        Message with the remedy.
+    """
+    parts = trainer.execution.accumulate
+    message = f"{-(-len(positions) // parts)} samples do not fit into the memory of {trainer.device}"
+    while parts < len(positions):
+        parts *= 2
+        trainer.execution = replace(trainer.execution, accumulate=parts)
+        try:
+            if world == 1:
+                torch.cuda.empty_cache()
+                trainer.step(convert_to_tensors(batch), positions)
+        except torch.OutOfMemoryError:
+            continue
+        fit = f", {-(-len(positions) // parts)} fit" if world == 1 else ""
+        return f"{message}{fit}; use --gradient-accumulation-steps {parts}"
+    return f"{message}; use a smaller preset or a GPU with more memory"
 
 
 def write_step(run: TrainingRun, step: int) -> None:

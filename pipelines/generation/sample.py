@@ -9,6 +9,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
+import torch
 
 from models.execution import SamplingExecution
 from models.labels import LABELS, compose_label, require_labels
@@ -226,21 +227,31 @@ class Sampler:
         indices = request.indices(shard)
         scenes = []
         for start in range(0, len(indices), self.batch_size):
-            chosen = indices[start : start + self.batch_size]
-            scenes += self.pipeline.generate(
-                labels=[request.labels[i % len(request.labels)] for i in chosen],
+            scenes += self.generate(indices[start : start + self.batch_size])
+        if request.repair:
+            scenes = [self.repair.apply_to(scene, np.ones(len(scene), bool))[0] for scene in scenes]
+        shard.write(scenes)
+        return {"id": shard.number, "scenes": len(indices), "seconds": time.perf_counter() - started}
+
+    def generate(self, indices: Sequence[int]) -> list[Scene]:
+        """Generate the scenes of a batch."""
+        request = self.request
+        try:
+            return self.pipeline.generate(
+                labels=[request.labels[i % len(request.labels)] for i in indices],
                 seed=request.seed,
-                indices=chosen,
+                indices=indices,
                 num_inference_steps=request.num_inference_steps,
                 guidance_scale=request.guidance_scale,
                 noise_scaling=request.noise_scaling,
                 existence_threshold=request.existence_threshold,
                 run=request.run,
             )
-        if request.repair:
-            scenes = [self.repair.apply_to(scene, np.ones(len(scene), bool))[0] for scene in scenes]
-        shard.write(scenes)
-        return {"id": shard.number, "scenes": len(indices), "seconds": time.perf_counter() - started}
+        except torch.OutOfMemoryError as error:
+            raise ValueError(
+                f"{len(indices)} scenes do not fit into the memory of {self.pipeline.device}; use a --batch-size below"
+                f" {len(indices)}, or --precision bf16"
+            ) from error
 
 
 def sample_scenes(

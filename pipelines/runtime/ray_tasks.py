@@ -42,16 +42,20 @@ def map_tasks(
     task = ray.remote(num_cpus=num_cpus, max_retries=MAX_RETRIES)(function)
     waiting = iter(items)
     running: list[ray.ObjectRef] = []
+
+    def submit() -> None:
+        limit = at_once or int(TASKS_PER_CPU * max(1, ray.cluster_resources().get("CPU", 1)))
+        running.extend(
+            task.options(name=function.__name__).remote(item) for item in islice(waiting, limit - len(running))
+        )
+
     try:
-        while True:
-            limit = at_once or int(TASKS_PER_CPU * max(1, ray.cluster_resources().get("CPU", 1)))
-            running += [
-                task.options(name=function.__name__).remote(item) for item in islice(waiting, limit - len(running))
-            ]
-            if not running:
-                return
-            done, running = ray.wait(running)
-            yield ray.get(done[0])
+        submit()
+        while running:
+            done, running[:] = ray.wait(running)
+            result = ray.get(done[0])
+            submit()  # before the caller uses the result
+            yield result
     finally:
         for reference in running:
             ray.cancel(reference)
