@@ -24,6 +24,7 @@ BEFORE = dict.fromkeys(
 # Pages whose commands take long. Other tests run the same jobs with smaller settings.
 SLOW_PAGES = (
     "docs/concepts/sampling.md",
+    "docs/getting_started.md",
     "docs/how_to/edit_scenes.md",
     "docs/how_to/import_scenes.md",
     "docs/how_to/own_drives.md",

@@ -229,6 +229,7 @@ def test_train_lvae_names_truncated_shard(home, tmp_path):
         train(Config(preset="smoke", dataset=str(tmp_path / "data"), name="lvae-truncated"))
 
 
+@pytest.mark.slow
 def test_encode_reports_worker_error_in_one_line(home, tmp_path):
     """If an actor reads a truncated shard, the job exits with code 2 and prints no traceback."""
     shutil.copytree(home / "datasets/smoke", tmp_path / "data")
