@@ -21,6 +21,7 @@ import torch
 from ray import cloudpickle
 from ray.experimental.internal_kv import _internal_kv_get, _internal_kv_put
 from ray.train import Checkpoint, CheckpointConfig, FailureConfig, RunConfig, ScalingConfig
+from ray.train.v2._internal.execution import context as reporting
 from ray.train.v2.api.exceptions import WorkerGroupError
 
 from jobs.support.cli import find_root_cause
@@ -81,8 +82,8 @@ def count_threads(local_workers: int) -> int:
 
 def train_worker(run: TrainingRun) -> None:
     """Train in one worker: read batches, take steps, and regularly log, save a checkpoint and validate."""
-    logging.getLogger("ray.train").setLevel(logging.WARNING)
-    logging.getLogger("ray.data").setLevel(logging.WARNING)
+    for name in ("ray.train", "ray.data", reporting.__file__):  # The logger of reports is named after its file.
+        logging.getLogger(name).setLevel(logging.WARNING)
     context = ray.train.get_context()
     rank, world = context.get_world_rank(), context.get_world_size()
     torch.set_num_threads(count_threads(context.get_local_world_size()))
