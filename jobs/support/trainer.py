@@ -19,6 +19,7 @@ import ray.train
 import ray.train.torch
 import torch
 from ray import cloudpickle
+from ray.exceptions import RayActorError
 from ray.experimental.internal_kv import _internal_kv_get, _internal_kv_put
 from ray.train import Checkpoint, CheckpointConfig, FailureConfig, RunConfig, ScalingConfig
 from ray.train.v2._internal.execution import context as reporting
@@ -279,6 +280,8 @@ def fit(run: TrainingRun, num_workers: int, output: str, min_workers: int | None
 def fit_with_retries(run: TrainingRun, scaling: ScalingConfig) -> ray.train.Result:
     """Run Ray Train; after RETRIES failures, continue if there is a new checkpoint since the first of them.
 
+    If the process that controls the workers dies, the training starts again from its last checkpoint.
+
     Args:
         run: Training run.
         scaling: Number and resources of the workers.
@@ -288,6 +291,7 @@ def fit_with_retries(run: TrainingRun, scaling: ScalingConfig) -> ray.train.Resu
     """
     file_system, path = storage.resolve_uri(run.storage_path)
     packed = cloudpickle.dumps(partial(train_worker, run))  # pyright: ignore[reportPrivateImportUsage]
+    lost_controllers = 0  # Since the last checkpoint.
     while True:
         before = find_last_checkpoint(run)
         trainer = ray.train.torch.TorchTrainer(
@@ -304,6 +308,11 @@ def fit_with_retries(run: TrainingRun, scaling: ScalingConfig) -> ray.train.Resu
         )
         try:
             return trainer.fit()
+        except RayActorError:
+            lost_controllers = lost_controllers + 1 if find_last_checkpoint(run) == before else 0
+            if lost_controllers > RETRIES:
+                raise
+            print_event(f"{run.name}: the controller of the workers died; training continues", {"event": "retry"})
         except WorkerGroupError as error:
             is_bug = any(isinstance(find_root_cause(part), ValueError) for part in error.worker_failures.values())
             if is_bug or find_last_checkpoint(run) == before:

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import ray.train.torch
+from ray.exceptions import RayActorError
 from ray.train.v2.api.exceptions import WorkerGroupError
 
 from jobs.support import trainer
@@ -37,6 +38,15 @@ def test_training_continues_while_there_are_new_checkpoints(monkeypatch, tmp_pat
     died = WorkerGroupError("killed", {0: RuntimeError("worker died")})
     rounds = [("checkpoint_1", died), ("checkpoint_2", died), ("checkpoint_3", died), ("checkpoint_4", "done")]
     assert run_rounds(monkeypatch, tmp_path, rounds) == ("done", 4)
+
+
+def test_lost_controllers_are_replaced(monkeypatch, tmp_path):
+    lost = RayActorError()
+    rounds = [("", lost)] * trainer.RETRIES + [("checkpoint_1", lost), ("checkpoint_1", "done")]
+    assert run_rounds(monkeypatch, tmp_path, rounds) == ("done", trainer.RETRIES + 2)
+    rounds = [("checkpoint_1", lost)] * (trainer.RETRIES + 2)
+    with pytest.raises(RayActorError):
+        run_rounds(monkeypatch, tmp_path, rounds)
 
 
 @pytest.mark.parametrize(
