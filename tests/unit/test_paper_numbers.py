@@ -1,0 +1,50 @@
+"""Test that the paper's presets and constants have the numbers of docs/reference/paper.md."""
+
+import ast
+import importlib
+import re
+from typing import Any
+
+import pytest
+from helpers import ROOT
+
+from jobs.outpaint_scenes import Config as OutpaintConfig
+from models.layout import LayoutSpec
+from models.lvae import LayoutVAE
+from models.presets import DIT_PRESETS, LVAE_PRESETS
+
+ROW = re.compile(r"^\| ([^|]+) \| ([^|]+) \| `([^`]+)` \| ([^|]+) \|$", re.M)
+ROWS = ROW.findall((ROOT / "docs/reference/paper.md").read_text())
+
+
+def make_lvae() -> LayoutVAE:
+    return LayoutVAE(layout=LayoutSpec().to_dict(), **LVAE_PRESETS["kitti360"].architecture())
+
+
+def count_parameters(model: LayoutVAE) -> float:
+    return round(sum(p.numel() for p in model.parameters()) / 1e6, 1)
+
+
+def list_names() -> dict[str, Any]:
+    names: dict[str, Any] = {"lvae": LVAE_PRESETS["kitti360"], "dit": DIT_PRESETS["kitti360"]}
+    names |= {"dit_l": DIT_PRESETS["kitti360-l"], "dit_xl": DIT_PRESETS["kitti360-xl"]}
+    names |= {function.__name__: function for function in (make_lvae, count_parameters, len, tuple)}
+    for module in set(re.findall(r"\b((?:models|pipelines)(?:\.[a-z_]+)+)\.[A-Z]", str(ROWS))):
+        importlib.import_module(module)
+    return names | {"OutpaintConfig": OutpaintConfig} | {n: importlib.import_module(n) for n in ("models", "pipelines")}
+
+
+def test_page_lists_the_paper():
+    assert len(ROWS) > 50
+    page = (ROOT / "docs/reference/paper.md").read_text()
+    assert page.count("\n| ") - page.count("\n| quantity |") == len(ROWS)  # Each row has a field.
+
+
+@pytest.mark.parametrize(("quantity", "value", "field", "place"), ROWS, ids=[row[0] for row in ROWS])
+def test_field_has_the_number_of_the_paper(quantity, value, field, place):
+    assert eval(field, list_names()) == ast.literal_eval(value), f"{quantity}: {place}"
+
+
+def test_av2_has_the_networks_of_the_paper():
+    assert LVAE_PRESETS["av2"].model == LVAE_PRESETS["kitti360"].model
+    assert DIT_PRESETS["av2"].model == DIT_PRESETS["kitti360"].model
