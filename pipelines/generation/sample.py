@@ -234,7 +234,17 @@ class Sampler:
         return {"id": shard.number, "scenes": len(indices), "seconds": time.perf_counter() - started}
 
     def generate(self, indices: Sequence[int]) -> list[Scene]:
-        """Generate the scenes of a batch."""
+        """Generate the scenes of a batch.
+
+        Args:
+            indices: Numbers of the scenes.
+
+        Returns:
+            Scenes in the order of the numbers.
+
+        Raises:
+            ValueError: The batch does not fit into the memory of the GPU. The message names the remedy.
+        """
         request = self.request
         try:
             return self.pipeline.generate(
