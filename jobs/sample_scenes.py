@@ -54,7 +54,7 @@ class Config:
     batch_size: int = 8
     """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding."""
     precision: Literal["fp32", "bf16"] = "fp32"
-    """Precision of the transformer (paper: fp32). bf16 is faster on GPUs and changes scenes by rounding."""
+    """Precision of the transformer. bf16 is faster on GPUs and changes scenes by rounding."""
     cuda_graphs: bool = False
     """Replay each denoising step as one CUDA graph; faster for small batches, and ignored without a GPU."""
     compile: bool = False

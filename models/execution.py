@@ -1,7 +1,7 @@
 """How the denoising network runs during sampling: precision, CUDA graphs and compiled blocks.
 
-The paper runs its network in float32. All options here change results by rounding only. They are off by default, except
-that noise for a GPU is drawn ahead.
+The paper does not state a precision. By default, the network runs in float32, and all options are off. They change
+results by rounding only.
 """
 
 from __future__ import annotations

@@ -103,12 +103,15 @@ def train_worker(run: TrainingRun) -> None:
     feed = measure_waiting(iterate_batches(run.stream, run.reader, trainer.steps_done, run.settings.steps, rank, world))
     for batch, seconds in feed:
         waited += seconds
+        is_memory_full = False
         try:
             losses = trainer.step(convert_to_tensors(batch), positions, weight)
         except NonFiniteLossError as error:
             raise ValueError(with_scene_ids(error, run.stream)) from error
-        except torch.OutOfMemoryError as error:
-            raise ValueError(describe_fitting_batch(trainer, batch, positions, world)) from error
+        except torch.OutOfMemoryError:
+            is_memory_full = True
+        if is_memory_full:  # Here, the error no longer keeps the tensors of the failed step in memory.
+            raise ValueError(describe_fitting_batch(trainer, batch, positions, world))
         step, last = trainer.steps_done, trainer.steps_done == run.settings.steps
         if rank == 0 and (last or time.perf_counter() - told > TELL_S):
             write_step(run, step)
