@@ -59,6 +59,12 @@ class Config:
     """Weight of the KL divergence, summed over the latent (default: as in the preset; paper: 1e-6)."""
     latent_noise: float | None = None
     """Noise on latents during training, in channel standard deviations (default: as in the preset; paper: 0)."""
+    warmup_steps: int | None = None
+    """Number of initial steps during which the learning rate rises linearly (default: as in the preset; paper: 0)."""
+    grad_clip: float | None = None
+    """Largest gradient norm; 0 switches clipping off (default: as in the preset; the paper does not mention it)."""
+    init_from_data: bool | None = None
+    """Start from the means of the data and a small posterior variance (default: as in the preset; paper: no)."""
     gradient_accumulation_steps: int = 1
     """Divide each worker's batch into this number of parts, which are processed in sequence to save memory."""
     precision: Literal["auto", "fp32", "bf16"] = "auto"

@@ -17,10 +17,11 @@ from models.batch import LayoutBatch
 from models.layout import FEATURES, LayoutSpec
 from models.vae.cell_decoder import CellDecoder
 from models.vae.config import Branches, GroundConfig, LayoutVAEConfig, ObjectConfig, nest_flat_options, parse_options
+from models.vae.detr_decoder import DETRDecoder
 from models.vae.ground import GroundDecoder, GroundEncoder, init_from_data
 from models.vae.matching import MatchWeights
-from models.vae.objects import ObjectDecoder, ObjectEncoder
-from models.vae.outputs import LayoutOutput, Posterior
+from models.vae.objects import ObjectEncoder
+from models.vae.outputs import LayoutOutput, Posterior, Proposals
 
 # Initial log-variance of the posterior (sigma 0.14). With this small sigma, the latent mean is larger than the noise
 # from the first step. With sigma 1, the loss after 300 steps on one batch is 1.5 times as high
@@ -31,6 +32,8 @@ SOLVED_LOGVAR = -8.0  # Sigma 0.018, for a ground branch with a shortcut (models
 BRANCHES = ("both", "ground", "objects")
 OBJECT_DECODER = "object_decoder."  # Prefix of the object decoder's parameter names.
 EMPTY_LOGIT = -6.0  # Occupancy logit of a model without a ground branch.
+# Standard deviation of the noise on true primitives of denoising queries: centre (m) and Cholesky parameters (sqrt(m)).
+DENOISING_NOISE = (1.0, 0.2)
 
 
 def compute_clamped_logit(probability: Tensor) -> Tensor:
@@ -84,13 +87,12 @@ class LayoutVAE(ConfiguredModel):
                 f"LayoutVAE: the side of the square grid must be a multiple of {ground.cell_px} px, got {spec.grid}"
             )
         size, num_classes = spec.grid.rows // ground.cell_px, len(spec.ground_classes)
-        # Units of distances in losses. The cell decoder predicts centres relative to a cell, so its unit of distance is
-        # one cell. DETR predicts normalised centres, so it uses the normalised units.
-        self.feature_unit = (
-            spec.feature_unit(spec.grid.rows * spec.grid.resolution_m / size)
-            if objects.decoder == "cells"
-            else (1.0,) * FEATURES
-        )
+        cell_m = spec.grid.rows * spec.grid.resolution_m / size
+        self.feature_unit = {  # Unit of distances in losses.
+            "normalised": (1.0,) * FEATURES,
+            "metres": spec.feature_unit(1.0),
+            "cells": spec.feature_unit(cell_m),
+        }[objects.loss_unit]
         self.latent_shape = (
             latent_channels * (2 if branches == "both" else 1),
             size,
@@ -101,17 +103,12 @@ class LayoutVAE(ConfiguredModel):
         if branches != "objects":
             self.ground_encoder = GroundEncoder(num_classes, latent_channels, ground, shortcut)
             self.ground_decoder = GroundDecoder(num_classes, seen, ground, shortcut)
-            with torch.no_grad():
-                logvar = SOLVED_LOGVAR if shortcut else INITIAL_LOGVAR
-                cast(Tensor, self.ground_encoder.net.conv_out.bias)[latent_channels:] = logvar
         if branches != "ground":
             self.object_encoder = ObjectEncoder(spec.slots, latent_channels, size, objects, shortcut)
             if objects.decoder == "detr":
-                self.object_decoder = ObjectDecoder(spec.slots, seen, size, objects)
+                self.object_decoder = DETRDecoder(spec.slots, seen, size, objects)
             else:
                 self.object_decoder = CellDecoder(spec.slots, seen, size, objects)
-            with torch.no_grad():
-                self.object_encoder.grid[latent_channels:] = INITIAL_LOGVAR
 
     @classmethod
     def upgrade_config(cls, config: dict[str, Any]) -> dict[str, Any]:
@@ -143,19 +140,24 @@ class LayoutVAE(ConfiguredModel):
 
     @torch.no_grad()
     def init_from_data(self, batch: LayoutBatch) -> None:
-        """Initialise the outputs to their means over a sample of training layouts.
+        """Initialise outputs to their means over a sample of training layouts, and the posterior to a small variance.
 
         Adam moves a bias by about the learning rate per step. With initial biases of zero, training would need
-        thousands of steps to learn that poles are thin and that most pixels are not road. For the initialisation of the
-        shortcuts, see models/vae/ground.py.
+        thousands of steps to learn that poles are thin and that most pixels are not road. With a posterior variance of
+        1, the noise would hide the latent mean at first. For the initialisation of the shortcuts, see
+        models/vae/ground.py.
 
         Args:
             batch: Training layouts.
         """
+        channels = self.config.latent_channels
         if self.ground_encoder and self.ground_decoder:
             init_from_data(self.ground_encoder, self.ground_decoder, batch.height, batch.occupied)
-        if not self.object_decoder:
+            bias = cast(Tensor, self.ground_encoder.net.conv_out.bias)
+            bias[channels:] = SOLVED_LOGVAR if self.config.shortcut else INITIAL_LOGVAR
+        if not (self.object_encoder and self.object_decoder):
             return
+        self.object_encoder.grid[channels:] = INITIAL_LOGVAR
         groups = list(zip(batch.features.split(self.spec.slots, 1), batch.real.split(self.spec.slots, 1), strict=True))
         features = torch.stack([f[r].mean(dim=0) if r.any() else f.new_full((FEATURES,), 0.5) for f, r in groups])
         count = torch.stack([r.sum() / len(r) for _, r in groups])
@@ -212,7 +214,9 @@ class LayoutVAE(ConfiguredModel):
         mean, logvar = (torch.cat(part, dim=1) for part in zip(*moments, strict=True))
         return Posterior(mean, logvar.clamp(-30, 20))
 
-    def decode(self, latent: Float[Tensor, "batch c2 h w"]) -> LayoutOutput:
+    def decode(
+        self, latent: Float[Tensor, "batch c2 h w"], noised: Tensor | None = None, real: Tensor | None = None
+    ) -> LayoutOutput:
         """Decode latents to layouts.
 
         With `split_latent`, each decoder reads only its half of the channels. Otherwise, both decoders read all
@@ -220,6 +224,8 @@ class LayoutVAE(ConfiguredModel):
 
         Args:
             latent: Joint latents.
+            noised: (batch, groups, N, 9) features of true primitives with noise, for denoising queries in training.
+            real: (batch, N); True for each slot that holds a primitive.
 
         Returns:
             Output of both decoders.
@@ -227,8 +233,19 @@ class LayoutVAE(ConfiguredModel):
         split = self.config.split_latent and self.config.branches == "both"
         ground, objects = latent.chunk(2, dim=1) if split else (latent, latent)
         height, occupancy_logit = self.decode_ground(ground)
-        unit, branches = self.feature_unit, self.config.branches
-        return LayoutOutput(height, occupancy_logit, *self.decode_objects(objects), unit, branches)
+        found, decoder = self.decode_objects(objects, noised, real), self.object_decoder
+        return LayoutOutput(
+            height,
+            occupancy_logit,
+            found.features,
+            found.existence_logit,
+            decoder.proposals if decoder else (0,) * len(self.spec.slots),
+            decoder.match_weights if decoder else MatchWeights(),
+            self.feature_unit,
+            self.config.branches,
+            found.auxiliary,
+            found.denoised,
+        )
 
     def decode_ground(self, latent: Float[Tensor, "batch c h w"]) -> tuple[Tensor, Tensor]:
         """Decode the ground.
@@ -245,26 +262,32 @@ class LayoutVAE(ConfiguredModel):
         height = latent.new_zeros(len(latent), len(self.spec.ground_classes), grid.rows, grid.cols)
         return height, torch.full_like(height, EMPTY_LOGIT)
 
-    def decode_objects(self, latent: Float[Tensor, "batch c h w"]) -> tuple[Tensor, Tensor, tuple, MatchWeights]:
+    def decode_objects(
+        self, latent: Float[Tensor, "batch c h w"], noised: Tensor | None = None, real: Tensor | None = None
+    ) -> Proposals:
         """Decode the objects.
 
         Args:
             latent: Channels that the object decoder reads.
+            noised: (batch, groups, N, 9) features of true primitives with noise, for denoising queries.
+            real: (batch, N); True for each slot that holds a primitive.
 
         Returns:
-            Features, existence logits, number of proposals per category, and weights of the matching cost. If the model
-            has no object branch, there are no proposals.
+            Predicted primitives. If the model has no object branch, there are none.
         """
+        if isinstance(self.object_decoder, DETRDecoder):
+            return self.object_decoder(latent, noised, real)
         if self.object_decoder:
-            return *self.object_decoder(latent), self.object_decoder.proposals, self.object_decoder.match_weights
+            return self.object_decoder(latent)
         features = latent.new_zeros(len(latent), 0, FEATURES)
-        return features, features[..., 0], (0,) * len(self.spec.slots), MatchWeights()
+        return Proposals(features, features[..., 0])
 
     def forward(
         self,
         batch: LayoutBatch,
         noise: Float[Tensor, "batch c2 h w"],
         corruption: Float[Tensor, "batch c2 h w"] | None = None,
+        query_noise: Float[Tensor, "batch groups n 9"] | None = None,
     ) -> tuple[LayoutOutput, Posterior]:
         """Sample latents from the posterior and decode them.
 
@@ -278,6 +301,7 @@ class LayoutVAE(ConfiguredModel):
             corruption: Noise that is added to the latent; None: no noise. The unit of this noise is the standard
                 deviation of each channel over the cells of a scene. This noise makes decoders tolerate errors in
                 sampled latents.
+            query_noise: Standard normal noise of the denoising queries; None: no denoising queries.
 
         Returns:
             Output of the decoders, and the posterior.
@@ -286,4 +310,9 @@ class LayoutVAE(ConfiguredModel):
         latent = posterior.sample(noise)
         if corruption is not None:
             latent = latent + corruption * posterior.mean.std(dim=(2, 3), keepdim=True)
-        return self.decode(latent), posterior
+        noised = None
+        if query_noise is not None:
+            center, cholesky = DENOISING_NOISE
+            scale = self.spec.feature_unit(center)[:3] + self.spec.feature_unit(cholesky**2)[3:]
+            noised = (batch.features[:, None] + query_noise * query_noise.new_tensor(scale)).clamp(0, 1)
+        return self.decode(latent, noised, batch.real), posterior

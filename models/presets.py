@@ -34,6 +34,9 @@ class LVAEPreset:
         kl_weight: Weight of the KL loss, which is summed over the latent.
         latent_noise: Scale of the noise that is added to training latents. The noise makes decoders tolerate errors in
             sampled latents. The paper adds no noise.
+        init_from_data: If True, training starts from the means of the data and a small posterior variance
+            (`LayoutVAE.init_from_data`). If False, it starts from the random weights of torch, because the paper
+            mentions no other start.
     """
 
     source: str
@@ -49,6 +52,7 @@ class LVAEPreset:
     ema_decay: float | None = None
     kl_weight: float = 1e-6
     latent_noise: float = 0.0
+    init_from_data: bool = True
 
     def architecture(self) -> dict:
         """Return all keyword arguments of `LayoutVAE` except the layout."""
@@ -62,10 +66,11 @@ QUICK: dict[str, Any] = {"learning_rate": 4e-3, "final_learning_rate": 1e-5, "wa
 # objects.
 PAPER = LayoutVAEConfig(32, GroundConfig((64, 128, 256, 512), 32), ObjectConfig(512, 6, 8, 1024, 1024))
 SMOKE = LayoutVAEConfig(4, GroundConfig((8, 16, 16), 4), ObjectConfig(32, 1, 2, 64, 32))
-SMALL_CELLS = ObjectConfig(128, 2, 4, 256, 256, decoder="cells", min_proposals_per_cell=3)
-PAPER_CELLS = replace(PAPER.objects, decoder="cells", min_proposals_per_cell=3)
+SMALL_CELLS = ObjectConfig(128, 2, 4, 256, 256, decoder="cells", min_proposals_per_cell=3, loss_unit="cells")
+PAPER_CELLS = replace(PAPER.objects, decoder="cells", min_proposals_per_cell=3, loss_unit="cells")
 DEMO = LayoutVAEConfig(16, GroundConfig((32, 64), 8, 4, attention=False), SMALL_CELLS, shortcut=True)
 TOWN = LayoutVAEConfig(32, GroundConfig((32,), 8, 8, attention=False), SMALL_CELLS, shortcut=True)
+MINI = LayoutVAEConfig(32, GroundConfig((8, 16, 32, 64), 4), ObjectConfig(128, 3, 4, 256, 256))
 
 # fmt: off
 LVAE_PRESETS: dict[str, LVAEPreset] = {
@@ -74,8 +79,8 @@ LVAE_PRESETS: dict[str, LVAEPreset] = {
     "demo":     LVAEPreset("town",      128, DEMO,  8,     5_000,   latent_noise=0.3, **QUICK),
     "town":     LVAEPreset("town",      256, TOWN,  8,     2_000,   kl_weight=1e-7, **QUICK),
     # The paper reports three days of training on one A100 but not the number of steps.
-    "kitti360": LVAEPreset("kitti360",  256, PAPER, 32,    300_000),
-    "av2":      LVAEPreset("av2",       256, PAPER, 32,    300_000),
+    "kitti360": LVAEPreset("kitti360",  256, PAPER, 32,    300_000, init_from_data=False),
+    "av2":      LVAEPreset("av2",       256, PAPER, 32,    300_000, init_from_data=False),
     # This preset combines the paper's object encoder with the town's ground branch and the cell decoder.
     # The latent has the same shape as in the paper, but training costs less.
     "kitti360-light": LVAEPreset("kitti360", 256, replace(TOWN, objects=PAPER_CELLS), 32, 300_000,

@@ -27,7 +27,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from models.base import ConfiguredModel
 from models.batch import LayoutBatch
 from models.dit import DiT
-from models.layout import LayoutSpec
+from models.layout import FEATURES, LayoutSpec
 from models.lvae import LayoutVAE
 from models.sampling.diffusion import finish_drawing, make_keyed_generator, start_drawing
 from models.vae.losses import compute_lvae_loss
@@ -175,7 +175,11 @@ def sample_corruption(
 
 
 def make_layout_loss(
-    spec: LayoutSpec, latent_shape: tuple[int, int, int], kl_weight: float, latent_noise: float = 0.0
+    spec: LayoutSpec,
+    latent_shape: tuple[int, int, int],
+    kl_weight: float,
+    latent_noise: float = 0.0,
+    denoising_groups: int = 0,
 ) -> LossFunction:
     """Return the loss function of stage 1 (training of the layout VAE).
 
@@ -184,6 +188,7 @@ def make_layout_loss(
         latent_shape: Shape (c, h, w) of a latent.
         kl_weight: Weight of the KL loss.
         latent_noise: Scale of the noise that is added to training latents (`sample_corruption`); 0: no noise.
+        denoising_groups: Number of groups of denoising queries (`ObjectConfig.denoising_groups`).
 
     Returns:
         A function that computes the parts of the objective from compact layouts (`tensors.encode_layout`).
@@ -196,7 +201,9 @@ def make_layout_loss(
         batch = LayoutBatch.from_compact(arrays)
         noise = sample_noise(generators, latent_shape, device)
         corruption = sample_corruption(generators, latent_shape, latent_noise, device) if latent_noise else None
-        output, posterior = model(batch, noise, corruption)
+        query_shape = (denoising_groups, spec.num_slots, FEATURES)
+        query_noise = sample_noise(generators, query_shape, device) if denoising_groups else None
+        output, posterior = model(batch, noise, corruption, query_noise)
         with torch.autocast(device.type, enabled=False):  # Losses and matching costs are computed in float32.
             output, posterior = output.float(), posterior.float()
             parts = compute_lvae_loss(output, posterior, batch, spec, kl_weight).items()
@@ -488,7 +495,8 @@ def make_lvae_trainer(
     """
     execution = execution or ExecutionConfig()
     model = model.to(device)
-    loss = make_layout_loss(model.spec, model.latent_shape, kl_weight, latent_noise)
+    groups = model.config.objects["denoising_groups"]
+    loss = make_layout_loss(model.spec, model.latent_shape, kl_weight, latent_noise, groups)
     return Trainer(model, loss, settings, device, wrap(_compile_model(model, execution)), execution)
 
 

@@ -37,7 +37,17 @@ from pipelines.training.data_loader import LayoutReader, Stream
 from pipelines.training.latents import digest_weights, load_lvae
 
 # Options of the object branch that concern the decoder.
-OF_OBJECT_DECODER = ("decoder", "head_hidden", "min_proposals_per_cell")
+OF_OBJECT_DECODER = (
+    "decoder",
+    "head_hidden",
+    "min_proposals_per_cell",
+    "loss_unit",
+    "queries",
+    "learned_content",
+    "position_unit",
+    "auxiliary_losses",
+    "denoising_groups",
+)
 START_SCENES, START_SHARDS = 96, 16  # numbers of training scenes and shards from which the model is initialised
 
 
@@ -75,7 +85,7 @@ def prepare(config: Config) -> TrainingRun:
             row.kl_weight,
             row.latent_noise,
             execution,
-            sample,
+            sample if row.init_from_data else None,
             kept,
         ),
         stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
@@ -92,12 +102,13 @@ def prepare(config: Config) -> TrainingRun:
 def resolve_preset(config: Config) -> LVAEPreset:
     """Return the preset with the options that override it."""
     row = find_preset(LVAE_PRESETS, config.preset)
-    names = ("batch_size", "kl_weight", "latent_noise")
+    names = ("batch_size", "kl_weight", "latent_noise", "warmup_steps", "grad_clip", "init_from_data")
     row = replace(row, **{name: value for name in names if (value := getattr(config, name)) is not None})
     if row.kl_weight < 0:
         raise ValueError(f"--kl-weight is {row.kl_weight}, expected 0 or more")
-    if row.latent_noise < 0:
-        raise ValueError(f"--latent-noise is {row.latent_noise}, expected 0 or more")
+    for name in ("latent_noise", "warmup_steps", "grad_clip"):
+        if (value := getattr(row, name) or 0) < 0:
+            raise ValueError(f"--{name.replace('_', '-')} is {value}, expected 0 or more")
     return row
 
 
@@ -111,7 +122,7 @@ def make_optimizer_config(config: Config, row: LVAEPreset) -> OptimizerConfig:
             weight_decay=row.weight_decay,
             warmup_steps=row.warmup_steps,
             cycle_momentum=(0.85, 0.95),  # OneCycleLR's defaults, as in SLEDGE
-            grad_clip=row.grad_clip,
+            grad_clip=row.grad_clip or None,
             ema_decay=row.ema_decay,
             seed=config.seed,
         ),
@@ -136,6 +147,8 @@ def make_run_identity(
     )
     if config.flip or config.jitter:
         identity |= {"augmentation": asdict(augment)}
+    if not row.init_from_data:  # earlier versions always did
+        identity |= {"init_from_data": False}
     if (least := row.model.objects.min_proposals_per_cell) != 1:  # earlier versions did not record this option
         identity |= {"least_per_cell": least}
     return identity
@@ -253,7 +266,7 @@ def build(
     kl_weight: float,
     latent_noise: float,
     execution: ExecutionConfig,
-    sample: dict,
+    sample: dict | None,
     kept: Kept | None,
     device: torch.device,
     wrap: Wrap,
@@ -261,7 +274,8 @@ def build(
     """Return the Trainer of stage 1, with the same initial weights on every worker."""
     torch.manual_seed(settings.seed)
     model = LayoutVAE(layout=layout, **architecture)
-    model.init_from_data(LayoutBatch.from_compact(convert_to_tensors(sample)))
+    if sample is not None:
+        model.init_from_data(LayoutBatch.from_compact(convert_to_tensors(sample)))
     if kept:
         model.freeze_all_but_object_decoder(kept.state)
     return make_lvae_trainer(model, settings, kl_weight, device, wrap, execution, latent_noise)

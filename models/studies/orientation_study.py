@@ -29,8 +29,9 @@ from models.sampling.diffusion import make_keyed_generator
 from models.scene import make_yaw_rotation
 from models.training import OptimizerConfig
 from models.vae.config import ObjectConfig
+from models.vae.detr_decoder import DETRDecoder, OutputHeads
 from models.vae.losses import KL_WEIGHT, MEDIUM, compute_kl_loss
-from models.vae.objects import CATEGORY_EMBEDDING, ObjectDecoder, ObjectEncoder, OutputHeads
+from models.vae.objects import CATEGORY_EMBEDDING, ObjectEncoder
 from models.vae.outputs import Posterior
 
 GRID, LATENT_CHANNELS = 2, 16
@@ -123,7 +124,7 @@ class OneObjectAutoencoder(nn.Module):
     def __init__(self, entries: int) -> None:
         super().__init__()
         self.encoder = ObjectEncoder((1,), LATENT_CHANNELS, GRID, NETWORK)
-        self.decoder = ObjectDecoder((1,), LATENT_CHANNELS, GRID, NETWORK)
+        self.decoder = DETRDecoder((1,), LATENT_CHANNELS, GRID, NETWORK)
         self.encoder.project_in = nn.Linear(3 + entries + CATEGORY_EMBEDDING + 1, NETWORK.width)
         heads = cast(OutputHeads, self.decoder.heads[0])
         heads.features[-1] = nn.Linear(NETWORK.head_hidden, entries)
@@ -153,7 +154,7 @@ class OneObjectAutoencoder(nn.Module):
         Returns:
             Codes, normalised to [0, 1].
         """
-        return self.decoder(latent)[0][:, 0]
+        return self.decoder(latent).features[:, 0]
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from models.layout import FEATURES
 from models.limits import require_within
 from models.vae.config import ObjectConfig
 from models.vae.matching import MatchWeights
+from models.vae.outputs import Proposals
 
 REACH_CELLS = 0.5  # Largest distance of a proposal's centre from the border of its cell (in cells).
 MAX_PER_CELL = 4
@@ -64,9 +65,7 @@ class CellDecoder(nn.Module):
         middle = 1 - (torch.arange(self.latent_size, dtype=torch.float32) + 0.5) / self.latent_size
         return {"middle": torch.cartesian_prod(middle, middle)[:, None]}
 
-    def forward(
-        self, latent: Float[Tensor, "batch c h w"]
-    ) -> tuple[Float[Tensor, "batch n 9"], Float[Tensor, "batch n"]]:
+    def forward(self, latent: Float[Tensor, "batch c h w"]) -> Proposals:
         """Decode object latents.
 
         Args:
@@ -81,7 +80,7 @@ class CellDecoder(nn.Module):
         center_xy = (cast(Tensor, self.middle) + (values[..., :2] - 0.5) * self.reach).clamp(0, 1)
         features = torch.cat([center_xy, values[..., 2:]], dim=-1)  # (b, cells, k, 9)
         # The order (b, k, cells) sorts proposals by category, because k is sorted by category.
-        return features.transpose(1, 2).flatten(1, 2), out[..., 0].transpose(1, 2).flatten(1)
+        return Proposals(features.transpose(1, 2).flatten(1, 2), out[..., 0].transpose(1, 2).flatten(1))
 
     def init_from_data(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, " categories"]) -> None:
         """Set the output biases to the cell centres, and to the mean height, shape and existence of each category.

@@ -10,6 +10,9 @@ from models.options import Choice, Flag, Integer, Rule, Sequential, check_entrie
 
 Branches = Literal["both", "ground", "objects"]
 DECODERS = ("detr", "cells")
+QUERIES = ("learned", "anchors", "conditional")
+POSITION_UNITS = ("map", "cell")
+LOSS_UNITS = ("normalised", "metres", "cells")
 
 # Rules of the entries of a stored config.
 WIDTH = Integer(1, 2**16)
@@ -33,6 +36,12 @@ OBJECT_RULES: dict[str, Rule] = {
     "head_hidden": WIDTH,
     "decoder": Choice(DECODERS),
     "min_proposals_per_cell": Integer(0, 1000),
+    "loss_unit": Choice(LOSS_UNITS),
+    "queries": Choice(QUERIES),
+    "learned_content": Flag(),
+    "position_unit": Choice(POSITION_UNITS),
+    "auxiliary_losses": Flag(),
+    "denoising_groups": Integer(0, 100),
 }
 
 
@@ -73,6 +82,14 @@ class ObjectConfig:
         head_hidden: Width of the output networks.
         decoder: "detr", as in the paper, or "cells" (models/vae/cell_decoder.py).
         min_proposals_per_cell: Minimum number of proposals per category and cell (only for the decoder "cells").
+        loss_unit: Unit of distances in matching and losses: "normalised" coordinates, as in the paper, "metres" or
+            "cells" of the latent grid. The Cholesky parameters have the square root of this unit.
+        queries: Only for the decoder "detr", as are the following options: "learned" embeddings, as in the paper,
+            "anchors" or "conditional" (models/vae/detr_decoder.py).
+        learned_content: If True, the contents of queries start from learned values instead of zeros.
+        position_unit: Unit of the sine position embeddings: "map" or "cell" (`detr_decoder.embed_positions`).
+        auxiliary_losses: If True, each layer of the decoder has a loss in training.
+        denoising_groups: Number of groups of denoising queries in training.
     """
 
     width: int = 512
@@ -82,6 +99,12 @@ class ObjectConfig:
     head_hidden: int = 1024
     decoder: str = "detr"
     min_proposals_per_cell: int = 1
+    loss_unit: str = "normalised"
+    queries: str = "learned"
+    learned_content: bool = False
+    position_unit: str = "map"
+    auxiliary_losses: bool = False
+    denoising_groups: int = 0
 
 
 @dataclass(frozen=True)
@@ -135,6 +158,9 @@ def nest_flat_options(config: dict[str, Any]) -> dict[str, Any]:
             if branch in config:
                 raise ValueError(f"{branch} and {name} exclude each other: {name} is an option of earlier versions")
             nested.setdefault(branch, {})[renamed] = value
+    objects = nested.get("objects")
+    if isinstance(objects, Mapping) and objects.get("decoder") == "cells" and "loss_unit" not in objects:
+        nested["objects"] = {**objects, "loss_unit": "cells"}  # Versions before 0.3 had no option.
     return nested
 
 

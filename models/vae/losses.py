@@ -12,7 +12,7 @@ from torch import Tensor
 from models.batch import LayoutBatch
 from models.layout import LayoutSpec
 from models.vae.matching import match_primitives
-from models.vae.outputs import LayoutOutput, Posterior
+from models.vae.outputs import LayoutOutput, Posterior, Prediction
 
 OCCUPANCY_WEIGHT, HEIGHT_WEIGHT, KL_WEIGHT = 1.0, 9.0, 1e-6
 
@@ -44,6 +44,7 @@ class LVAELoss:
         center: Centre loss.
         cholesky: Cholesky loss.
         kl: KL loss.
+        auxiliary: Object losses of the other layers and of the denoising queries, if the object decoder has them.
     """
 
     occupancy: Tensor
@@ -52,11 +53,12 @@ class LVAELoss:
     center: Tensor
     cholesky: Tensor
     kl: Tensor
+    auxiliary: Tensor
 
     @property
     def total(self) -> Tensor:
         """Sum of all parts."""
-        return self.occupancy + self.height + self.existence + self.center + self.cholesky + self.kl
+        return self.occupancy + self.height + self.existence + self.center + self.cholesky + self.kl + self.auxiliary
 
     def items(self) -> dict[str, Tensor]:
         """Return the parts by name, and the total as `loss`."""
@@ -167,11 +169,28 @@ def compute_lvae_loss(
     """
     ground = float(output.branches != "objects")
     unit = batch.features.new_tensor(output.feature_unit)
-    proposed, truth = (output.features / unit, output.existence_logit), batch.features / unit
-    assignment = match_primitives(*proposed, truth, batch.real, spec.slots, output.proposals, output.match_weights)
-    existence, center, cholesky = compute_object_losses(
-        *proposed, truth, batch.real, assignment, spec, output.proposals
-    )
+    truth = batch.features / unit
+
+    def score(found: Prediction, groups: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+        features = found.features / unit
+        if groups:  # Slot k of a denoising query belongs to slot k of the truth.
+            aim, real = truth.repeat_interleave(groups, 0), batch.real.repeat_interleave(groups, 0)
+            slot = torch.arange(real.shape[1], device=real.device).expand_as(real)
+            assignment = torch.where(real, slot, -1)
+        else:
+            aim, real = truth, batch.real
+            assignment = match_primitives(
+                features, found.existence_logit, aim, real, spec.slots, output.proposals, output.match_weights
+            )
+        return compute_object_losses(features, found.existence_logit, aim, real, assignment, spec, output.proposals)
+
+    existence, center, cholesky = score(Prediction(output.features, output.existence_logit))
+    auxiliary = existence.new_zeros(())
+    for found in output.auxiliary:
+        auxiliary = auxiliary + sum(score(found))
+    for found in output.denoised:
+        _, *distances = score(found, len(found.features) // len(batch))
+        auxiliary = auxiliary + sum(distances)
     return LVAELoss(
         occupancy=ground * OCCUPANCY_WEIGHT * compute_occupancy_loss(output.occupancy_logit, batch.occupied),
         height=ground * HEIGHT_WEIGHT * compute_height_loss(output.height, batch.height, batch.occupied),
@@ -179,4 +198,5 @@ def compute_lvae_loss(
         center=center,
         cholesky=cholesky,
         kl=kl_weight * compute_kl_loss(posterior),
+        auxiliary=auxiliary,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -43,6 +44,35 @@ class Posterior:
         return self.mean + (0.5 * self.logvar).exp() * noise
 
 
+class Prediction(NamedTuple):
+    """Predicted primitives.
+
+    Attributes:
+        features: Normalised features of the proposals, ordered by category.
+        existence_logit: Logit of the existence probability of the proposals.
+    """
+
+    features: Float[Tensor, "batch proposals 9"]
+    existence_logit: Float[Tensor, "batch proposals"]
+
+
+class Proposals(NamedTuple):
+    """Output of an object decoder.
+
+    Attributes:
+        features: Normalised features of the proposals, ordered by category.
+        existence_logit: Logit of the existence probability of the proposals.
+        auxiliary: Predictions of the layers before the last, which have losses in training.
+        denoised: Predictions of the denoising queries, per layer. Their batch axis also counts the groups: the groups
+            of a sample follow one another. Slot k of a prediction belongs to slot k of the true layout.
+    """
+
+    features: Float[Tensor, "batch proposals 9"]
+    existence_logit: Float[Tensor, "batch proposals"]
+    auxiliary: tuple[Prediction, ...] = ()
+    denoised: tuple[Prediction, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class LayoutOutput:
     """Output of the decoders, normalised as in LayoutBatch.
@@ -57,6 +87,8 @@ class LayoutOutput:
         match_weights: Weights of the matching cost.
         feature_unit: Length unit of each normalised feature in matching and losses.
         branches: Branches of the model. The outputs of a missing branch are placeholders.
+        auxiliary: See `Proposals`.
+        denoised: See `Proposals`.
     """
 
     height: Float[Tensor, "batch ground rows cols"]
@@ -67,11 +99,17 @@ class LayoutOutput:
     match_weights: MatchWeights
     feature_unit: tuple[float, ...] = (1.0,) * FEATURES
     branches: str = "both"
+    auxiliary: tuple[Prediction, ...] = ()
+    denoised: tuple[Prediction, ...] = ()
 
     def float(self) -> LayoutOutput:
         """Convert to float32, because losses need more precision than bfloat16."""
         names = ("height", "occupancy_logit", "features", "existence_logit")
-        return replace(self, **{name: getattr(self, name).float() for name in names})
+        further = {
+            name: tuple(Prediction(*(part.float() for part in found)) for found in getattr(self, name))
+            for name in ("auxiliary", "denoised")
+        }
+        return replace(self, **{name: getattr(self, name).float() for name in names}, **further)
 
     def layouts(self) -> list[DecodedLayout]:
         """Return one numpy layout per sample, with probabilities instead of logits."""

@@ -38,7 +38,7 @@ def test_flat_options_of_version_0_1_become_nested(tmp_path):
     pipeline = PrITTIPipeline.from_pretrained(GOLDEN / "pipeline")
     ground, objects = pipeline.lvae.config.ground, pipeline.lvae.config.objects
     assert GroundConfig(**ground) == GroundConfig((4, 8), 2, 4, attention=False)
-    assert ObjectConfig(**objects) == ObjectConfig(8, 1, 2, 8, 8, "cells", 1)
+    assert ObjectConfig(**objects) == ObjectConfig(8, 1, 2, 8, 8, "cells", 1, "cells")
     assert pipeline.dit.config.prediction == "v_prediction"
     pipeline.save_pretrained(tmp_path)
     again = PrITTIPipeline.from_pretrained(tmp_path)

@@ -19,6 +19,7 @@ from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset
 from models.tensors import encode_layout, make_layout_batch
 from models.training import ExecutionConfig, OptimizerConfig, Trainer, make_lvae_trainer, sample_corruption
 from models.vae.config import nest_flat_options, override_options
+from models.vae.detr_decoder import embed_positions
 from models.vae.ground import (
     HEIGHT_WEIGHT,
     LOGITS_PER_PX,
@@ -162,7 +163,7 @@ def test_matching_of_surplus_proposals_is_optimal():
 
 def test_cell_decoder_proposals_lie_around_their_cell():
     decoder = make_small_lvae(decoder="cells").object_decoder
-    features, existence = decoder(torch.randn(1, 4, 8, 8) * 10)
+    features, existence, *_ = decoder(torch.randn(1, 4, 8, 8) * 10)
     assert features.shape == (1, sum(decoder.proposals), 9) and existence.shape == features.shape[:2]
     first = features[0, : decoder.proposals[0]].view(-1, 8, 8, 9)  # proposal, row, column, feature
     middle = 1 - (torch.arange(8) + 0.5) / 8
@@ -357,6 +358,81 @@ def test_lvae_overfits_one_batch(decoder, steps, rate, clip):
             )
     assert len(errors_m) == 40 and max(errors_m) < 1
     assert all(number == true for number, true in counts)
+
+
+DETR_OPTIONS = [
+    {},
+    {"auxiliary_losses": True, "learned_content": True},
+    {"queries": "anchors", "position_unit": "cell", "auxiliary_losses": True, "denoising_groups": 2},
+    {"queries": "conditional", "denoising_groups": 1},
+]
+
+
+@pytest.mark.parametrize("options", DETR_OPTIONS, ids=["paper", "auxiliary", "anchors", "conditional"])
+def test_detr_options_add_losses_in_training_only(options):
+    spec = small_spec()
+    architecture = override_options(LVAE_PRESETS["smoke"].architecture(), {"objects": options | {"layers": 3}})
+    lvae = LayoutVAE(layout=spec.to_dict(), **architecture)
+    batch = make_layout_batch([random_scene(0, n=20), random_scene(1, n=0)], spec)
+    lvae.init_from_data(batch)
+    groups = options.get("denoising_groups", 0)
+    query_noise = torch.randn(2, groups, spec.num_slots, 9) if groups else None
+    noise = torch.randn(2, *lvae.latent_shape)
+    output, posterior = lvae(batch, noise, query_noise=query_noise)
+    assert len(output.auxiliary) == (2 if options.get("auxiliary_losses") else 0)
+    assert [len(part.features) for part in output.denoised] == [2 * groups] * (3 if groups else 0)
+    losses = compute_lvae_loss(output, posterior, batch, spec)
+    assert torch.isfinite(losses.total) and (losses.auxiliary > 0) == bool(output.auxiliary or groups)
+    losses.total.backward()
+    unused = {name for name, p in lvae.object_decoder.named_parameters() if p.grad is None or not p.grad.any()}
+    first = "layers.0.self_attention."  # In the paper's DETR, the values of this attention are zeros.
+    unused = {name for name in unused if not name.startswith("heads.")}  # The batch has not all categories.
+    assert all(name.startswith(first) for name in unused) and bool(unused) == (options == {})
+    lvae.eval()
+    with torch.no_grad():
+        again = lvae(batch, noise, query_noise=query_noise)[0]
+    assert not again.auxiliary and torch.allclose(again.features, output.features, atol=1e-5)
+
+
+def test_denoising_queries_know_their_primitive():
+    """Queries without noise start at their primitive, so their centres are nearly right before training."""
+    options = {"objects": {"queries": "anchors", "denoising_groups": 1}}
+    spec = small_spec()
+    lvae = LayoutVAE(layout=spec.to_dict(), **override_options(LVAE_PRESETS["smoke"].architecture(), options))
+    batch = make_layout_batch([random_scene(i, n=20) for i in range(2)], spec)
+    lvae.init_from_data(batch)
+    silence = torch.zeros(2, 1, spec.num_slots, 9)
+    output, _ = lvae(batch, torch.zeros(2, *lvae.latent_shape), query_noise=silence)
+    found, truth = (part[batch.real][:, :3] for part in (output.denoised[-1].features, batch.features))
+    assert (found - truth).abs().mean() < 0.1 < (output.features[batch.real][:, :3] - truth).abs().mean()
+
+
+def test_position_embedding_equals_formula_of_detr():
+    """Carion et al.: sine and cosine of 2 pi y / h (then x / w), divided by 10000^(2 floor(k / 2) / (d / 2))."""
+    size, width = 5, 16
+    middle = torch.arange(size) + 0.5
+    for unit, scale in (("map", 2 * np.pi / size), ("cell", 1.0)):
+        found = embed_positions(torch.cartesian_prod(middle, middle), size, width, unit).numpy()
+        for cell in (0, 7, 24):
+            want = []
+            for position in (cell // size + 1, cell % size + 1):
+                for k in range(width // 2):
+                    angle = position * scale / 10_000 ** (2 * (k // 2) / (width // 2))
+                    want.append(np.cos(angle) if k % 2 else np.sin(angle))
+            assert np.allclose(found[cell], want, atol=1e-5)
+
+
+def test_loss_units_are_lengths():
+    spec, units = small_spec(), {}
+    for unit in ("normalised", "metres", "cells"):
+        options = override_options(LVAE_PRESETS["smoke"].architecture(), {"objects": {"loss_unit": unit}})
+        lvae = LayoutVAE(layout=spec.to_dict(), **options)
+        units[unit] = np.array(lvae.feature_unit)
+    extent_m = np.subtract(spec.center_bounds_m.high, spec.center_bounds_m.low)
+    cell_m = spec.grid.rows * spec.grid.resolution_m / lvae.latent_shape[1]
+    assert (units["normalised"] == 1).all()
+    assert np.allclose(units["metres"][:3], 1 / extent_m)
+    assert np.allclose(units["cells"] / units["metres"], [cell_m] * 3 + [cell_m**0.5] * 6)
 
 
 @pytest.mark.parametrize(
