@@ -1,6 +1,8 @@
 # Each target sets up what it needs in .venv; a second call does no set-up work.
 #
 #   make demo        train, sample and report with the demo preset
+#   make paper-kitti360 ROOT=DIR     train and evaluate the paper's models on KITTI-360, and write the paper's tables
+#   make paper-av2 ROOT=DIR          the same on Argoverse 2; for options such as --dry-run add ARGS="--dry-run"
 #   make lint        ruff (rules and format) and pyright
 #   make test-fast   tests/unit: no Ray, no browser, about three minutes
 #   make test        all tests but slow ones
@@ -24,9 +26,13 @@ export OMP_WAIT_POLICY ?= PASSIVE
 unexport PYTHONDONTWRITEBYTECODE
 
 TESTS := test test-fast test-slow coverage
-.PHONY: demo lint docs $(TESTS) browser clean
+.PHONY: demo paper-kitti360 paper-av2 lint docs $(TESTS) browser clean
 demo: .venv/ready
 	$(BIN)/python jobs/run_demo.py --output runs/demo
+
+paper-kitti360 paper-av2: .venv/ready
+	@test -n "$(ROOT)" || { echo "error: give the directory of the dataset: make $@ ROOT=DIR" >&2; exit 2; }
+	$(BIN)/python jobs/reproduce_paper.py $(@:paper-%=%) --input "$(ROOT)" --output "runs/$@" $(ARGS)
 
 lint: .venv/ready
 	$(BIN)/ruff check .

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable
-from typing import Any
 
 from jobs.encode_latents import Config as EncodeConfig
 from jobs.evaluate_scenes import Config as EvaluateConfig
@@ -21,6 +18,7 @@ from jobs.run_demo import Config
 from jobs.sample_scenes import Config as SampleConfig
 from jobs.support.cli import home_path, make_absolute
 from jobs.support.ray_session import start_ray
+from jobs.support.stages import Stages
 from jobs.train_dit import Config as DiTConfig
 from jobs.train_lvae import Config as LVAEConfig
 from models.uris import is_uri
@@ -30,25 +28,6 @@ from pipelines.schema.tables import read_scenes
 
 RELEASED = "town"
 CHECKPOINTS = 8  # number of checkpoints per training run; a validation with pictures runs at each checkpoint
-
-
-class Stages:
-    """Run stages in sequence, print the name of each stage, and record its duration in a file."""
-
-    def __init__(self, path: str, total: int) -> None:
-        self.path, self.total, self.started = path, total, time.perf_counter()
-        self.seconds: dict[str, float] = storage.read_json(path) if storage.exists(path) else {}
-        self.done = 0
-
-    def run(self, name: str, work: Callable[[], Any]) -> Any:
-        self.done += 1
-        print(f"\n[{self.done}/{self.total}] {name}", flush=True)
-        started = time.perf_counter()
-        result = work()
-        # A completed stage returns immediately, so the longest duration is kept.
-        self.seconds[name] = max(self.seconds.get(name, 0.0), time.perf_counter() - started)
-        storage.write_json(self.seconds, self.path)
-        return result
 
 
 def show_released(config: Config) -> None:

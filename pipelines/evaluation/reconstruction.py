@@ -9,6 +9,7 @@ import operator
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
+from operator import itemgetter
 
 import numpy as np
 import pyarrow as pa
@@ -22,6 +23,7 @@ from models.scene import CATEGORIES, Scene
 from models.tensors import EXISTENCE_THRESHOLD, DecodedLayout, decode_layout, make_layout_batch, resample_scene_ground
 from pipelines.evaluation.features import READER_CPUS, judge_labels
 from pipelines.geometry.voxels import NUM_CLASSES, OutsideCounts, VoxelGrid, count_outside, voxelize
+from pipelines.metrics.controls import damage_scene
 from pipelines.metrics.reconstruction import (
     MAX_DETECTIONS,
     MEMORY,
@@ -46,7 +48,7 @@ from pipelines.metrics.reconstruction import (
 from pipelines.metrics.validity import LABEL_MEASURES, compute_validity_rates
 from pipelines.rendering.render import render_3d, render_bev
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import MAX_RETRIES, flat_map_dataset, make_actor_graph, map_dataset
+from pipelines.runtime.ray_tasks import MAX_RETRIES, flat_map_dataset, make_actor_graph, map_dataset, map_tasks
 from pipelines.runtime.resources import find_device
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.run_guard import guard_options
@@ -55,6 +57,7 @@ from pipelines.schema.tables import Shard
 from pipelines.training.latents import digest_weights, load_lvae
 
 Chunk = tuple[Shard, list[int]]  # A shard and some of its rows.
+SCENES_PER_TASK = 32
 AP_VARIANTS = {
     "ranked": {},  # AP3D ranks all proposals, without a minimum existence probability.
     "ranked_100": {"max_detections": MAX_DETECTIONS},
@@ -452,6 +455,54 @@ def compute_reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, 
         "label_fidelity": compute_validity_rates(np.stack([r.labels for r in records]), LABEL_MEASURES),
         "truths": {CATEGORIES[c]: int(num_objects[c]) for c in present},
     }
+
+
+def score_limits(
+    scenes: SceneSubset, spec: LayoutSpec, voxel_range_m: tuple[float, float] = VOXEL_RANGE_M
+) -> dict[str, dict]:
+    """Score reconstructions without a network: the best that a layout can represent, and damaged scenes.
+
+    The ceiling encodes each scene to a layout and back. It loses objects without a slot, values outside the bounds and
+    detail below the resolution. The control does the same with a damaged copy of the scene: each object moves by up to
+    4 m, and the ground is shifted by 4 m (pipelines.metrics.controls).
+
+    Args:
+        scenes: Scenes to score.
+        spec: Layout of the model.
+        voxel_range_m: Lowest and highest z of the voxels (m).
+
+    Returns:
+        Scores as those of `evaluate_reconstruction`, by the names "ceiling" and "control".
+    """
+    voxels = make_voxel_grid(spec, voxel_range_m)
+
+    def score_scenes(item: tuple[int, Chunk]) -> tuple[int, dict[str, list[SceneRecord]]]:
+        place, (shard, rows) = item
+        found: dict[str, list[SceneRecord]] = {"ceiling": [], "control": []}
+        for number, scene in zip(rows, shard.scenes(rows), strict=True):
+            moved = damage_scene("moved", scene, scene, (shard.number, number))
+            damaged = damage_scene("ground_shifted", moved, moved, (shard.number, number))
+            for name, source in (("ceiling", scene), ("control", damaged)):
+                layout = represent_scene(source, spec)
+                latent = np.zeros((1, 1, 1), np.float32)
+                found[name].append(make_scene_record(scene, layout, latent, spec, voxels))
+        return place, found
+
+    chunks = list(enumerate(split_chunks(scenes, SCENES_PER_TASK)))
+    parts = [found for _, found in sorted(map_tasks(score_scenes, chunks), key=itemgetter(0))]
+    return {
+        name: compute_reconstruction_scores([record for part in parts for record in part[name]], spec, voxels)
+        for name in ("ceiling", "control")
+    }
+
+
+def represent_scene(scene: Scene, spec: LayoutSpec) -> DecodedLayout:
+    """Return a scene as the output of a perfect decoder: each slot with a primitive exists with probability 1."""
+    batch = make_layout_batch([scene], spec)
+    height, occupied, features, real = (
+        getattr(batch, name)[0].numpy() for name in ("height", "occupied", "features", "real")
+    )
+    return DecodedLayout(occupied, height, features, real.astype(np.float32), spec.slot_category)
 
 
 def _sum(parts: Iterable):

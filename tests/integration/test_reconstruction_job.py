@@ -9,9 +9,11 @@ from pipelines.evaluation.reconstruction import (
     Reconstruction,
     draw_scenes,
     evaluate_reconstruction,
+    score_limits,
 )
 from pipelines.reporting.reconstruction_report import render_reconstruction_html
 from pipelines.schema.scene_subset import SceneSubset
+from pipelines.training.latents import load_lvae
 
 
 def select_scenes(root: Path) -> SceneSubset:
@@ -73,3 +75,12 @@ def test_reconstruction_page_shows_truth_and_reconstruction(reconstruction_datas
     wanted = ("AP3D@50", "voxel mIoU", "Memory", "Content outside the voxel grid", "vegetation ellipsoid")
     missing = [words for words in (*wanted, *(row["scene_id"] for row in drawn)) if words not in html]
     assert not missing
+
+
+def test_limits_of_reconstruction_are_perfect_and_damaged(reconstruction_dataset, reconstruction):
+    spec = load_lvae(str(reconstruction_dataset / "lvae")).spec
+    found = score_limits(select_scenes(reconstruction_dataset), spec)
+    ceiling, control = found["ceiling"], found["control"]
+    assert ceiling["scenes"] == 11 and ceiling.keys() == reconstruction.scores.keys() - {"label_existence_threshold"}
+    assert ceiling["ap3d"] > 0.95 and ceiling["raster_ground_iou"] > 0.999
+    assert control["ap3d"] < 0.6 * ceiling["ap3d"] and control["ground_iou"] < 0.95 * ceiling["ground_iou"]

@@ -1,0 +1,222 @@
+"""Implementation of jobs/reproduce_paper.py."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import ray
+from rich.console import Console
+from rich.table import Table as Columns
+
+from jobs.implementation import preprocess_scenes, train_dit, train_lvae
+from jobs.implementation.ablate_lvae import compare_variants
+from jobs.implementation.encode_latents import encode
+from jobs.implementation.evaluate_scenes import evaluate
+from jobs.implementation.paper_plan import (
+    PAPER_SCENES,
+    Options,
+    Stage,
+    count_poses,
+    find_presets,
+    find_source,
+    make_plan,
+)
+from jobs.implementation.sample_scenes import sample
+from jobs.reproduce_paper import Av2
+from jobs.support.cli import home_path, make_absolute
+from jobs.support.outputs import hold_output
+from jobs.support.ray_session import start_ray
+from jobs.support.stages import Stages
+from jobs.support.terminal import print_table
+from models.presets import LVAE_PRESETS
+from models.uris import is_uri
+from pipelines.evaluation.reconstruction import score_limits
+from pipelines.reporting.paper_tables import Reproduced, build_paper_tables, compare_with_paper, format_paper_tables
+from pipelines.reporting.report import Table, Text, render_report_html
+from pipelines.runtime import storage
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.scene_subset import SceneSubset
+
+RUN: Mapping[str, Callable[[Any], Any]] = {
+    "preprocess_scenes": preprocess_scenes.main,
+    "train_lvae": train_lvae.train,
+    "encode_latents": encode,
+    "ablate_lvae": compare_variants,
+    "train_dit": train_dit.train,
+    "sample_scenes": sample,
+    "evaluate_scenes": evaluate,
+}
+GIGABYTE = 1e9
+CONTROL = "objects moved by up to 4 m"
+
+
+def main(config: Options) -> None:
+    source = find_source(config)
+    home = make_absolute(config.output) if config.output else home_path(f"paper-{source}")
+    check_weights(config)
+    os.environ["PRITTI_HOME"] = home
+    if not is_uri(home):  # The job writes all files under the output directory.
+        os.environ.pop("MLFLOW_TRACKING_URI", None)
+    counts = count_poses(config)
+    plan = make_plan(config, counts)
+    print(f"{make_absolute(config.input)}: {counts.train:,} training poses, {counts.test:,} test poses")
+    print_plan(plan, home)
+    if config.dry_run:
+        return
+    require_space(plan, home)
+    start_ray(training=True)
+    require_gpus(config)
+    stages = Stages(home_path("stages.json"), total=len(plan) + 1)
+    for stage in plan:
+        stages.run(stage.name, lambda stage=stage: RUN[stage.job](stage.config))
+    stages.run("write the tables", lambda: write_tables(config, stages.seconds))
+
+
+def check_weights(config: Options) -> None:
+    """Raise an error before hours are spent if a file is missing or an option does not fit the dataset."""
+    for option, path in (("--inception", config.inception), ("--vgg16", config.vgg16)):
+        if path and not storage.exists(make_absolute(path)):
+            raise ValueError(f"{option} {path} does not exist")
+    if isinstance(config, Av2) and config.scale == "paper" and set(config.transformers) != {"b"}:
+        raise ValueError(
+            f"--transformers {' '.join(config.transformers)}: on Argoverse 2, the paper has only DiT-B; use"
+            " --transformers b"
+        )
+    if not config.transformers or len(set(config.transformers)) != len(config.transformers):
+        raise ValueError(f"--transformers {' '.join(config.transformers)}: expected different sizes of b, l and xl")
+
+
+def print_plan(plan: list[Stage], home: str) -> None:
+    """Print the stages with their estimates, and the commands that do the same."""
+    table = Columns("stage", "hours", "GB", "basis of the time")
+    for stage in plan:
+        table.add_row(stage.name, f"{stage.hours:,.2f}", f"{stage.gigabytes:,.2f}", stage.basis)
+    total = (sum(s.hours for s in plan), sum(s.gigabytes for s in plan))
+    table.add_row("total", f"{total[0]:,.1f}", f"{total[1]:,.1f}", "")
+    Console(width=max(100, Console().width)).print(table)
+    print("Estimates; the stages are these commands:")
+    print(f"  export PRITTI_HOME={shlex.quote(home)}")
+    for stage in plan:
+        print(f"  {stage.command}")
+
+
+def require_space(plan: list[Stage], home: str) -> None:
+    """Raise an error if a local disk has less free space than the plan needs. Existing results count as free.
+
+    Raises:
+        ValueError: There is too little space.
+    """
+    if is_uri(home):
+        return
+    folder = next(parent for parent in (Path(home), *Path(home).parents) if parent.exists())
+    used = sum(path.stat().st_size for path in Path(home).rglob("*") if path.is_file()) if folder == Path(home) else 0
+    needed, free = sum(stage.gigabytes for stage in plan), (shutil.disk_usage(folder).free + used) / GIGABYTE
+    if needed > free:
+        raise ValueError(
+            f"the results need about {needed:,.1f} GB, but {folder} has {free:,.1f} GB; choose another --output"
+        )
+
+
+def require_gpus(config: Options) -> None:
+    """Raise an error if the networks of the paper would be trained on CPUs.
+
+    Raises:
+        ValueError: The cluster has no GPU.
+    """
+    wants = config.gpus is None or config.gpus > 0
+    if config.scale == "paper" and wants and not config.wait_for_resources_s and not count_gpus():
+        raise ValueError(
+            "the networks of the paper need GPUs, but this cluster has none; use --scale mini for a rehearsal,"
+            " --wait-for-resources if an autoscaler adds GPUs, or --gpus 0 to train on CPUs for months"
+        )
+
+
+def count_gpus() -> float:
+    """Return the number of GPUs of the cluster."""
+    return ray.cluster_resources().get("GPU", 0)
+
+
+def write_tables(config: Options, seconds: Mapping[str, float]) -> list[dict]:
+    """Compare all scores with the paper, and write tables.html, tables.md and tables.json."""
+    source = find_source(config)
+    found = collect_scores(config)
+    rows = compare_with_paper(source, found)
+    tables = build_paper_tables(rows)
+    for table in tables:
+        print_table(table)
+    remarks = describe_run(config)
+    durations = Table("Durations", ("stage", "minutes"), [(name, value / 60) for name, value in seconds.items()])
+    html = render_report_html("The paper's tables", [Text("This run", remarks), *tables, durations], source)
+    text = "\n".join(["# The paper's tables", "", *remarks, "", format_paper_tables(rows)])
+    with hold_output(home_path("tables"), "tables", config):
+        storage.write_text(html, home_path("tables.html"))
+        storage.write_text(text, home_path("tables.md"))
+        storage.write_json(rows, home_path("tables.json"))
+    print(f"tables: {home_path('tables.html')}")
+    return rows
+
+
+def describe_run(config: Options) -> list[str]:
+    """Return sentences that state how this run differs from the paper."""
+    source = find_source(config)
+    dataset = Dataset.open(home_path("datasets", source))
+    lvae, dit = find_presets(config, config.transformers[0])
+    described = [
+        f"Dataset {source}: {make_absolute(config.input)}, {dataset.spec.num_slots} slots per scene.",
+        f"Presets {lvae} and {dit}, seed {config.seed}.",
+        "The ceiling of a reconstruction is the scene encoded as a layout and decoded again without a network; its"
+        f" control also has {CONTROL} and the ground shifted by 4 m. The ceiling of a generation score is the score of"
+        f" other real scenes, its control that of real scenes with {CONTROL}.",
+    ]
+    if config.scale == "mini":
+        described.insert(0, "This is a rehearsal with small networks. Its scores say nothing about the paper's model.")
+    return described
+
+
+def collect_scores(config: Options) -> Reproduced:
+    """Read the scores of all evaluations, and score the ceiling and the control of the reconstruction."""
+    source = find_source(config)
+    data = home_path("datasets", source)
+    dataset = Dataset.open(data)
+    ours = storage.read_json(home_path("evaluations", "reconstruction", "metrics.json"))["reconstruction"]
+    path = home_path("evaluations", "reconstruction", "limits.json")
+    if not storage.exists(path):
+        subset = SceneSubset(data, dataset.source, "test")
+        spec = dataset.spec.with_resolution(LVAE_PRESETS[find_presets(config, "b")[0]].raster_px)
+        storage.write_json(score_limits(subset, spec), path)
+    study = home_path("ablations", "branches", "branches.json")
+    if storage.exists(study):
+        ours |= {"ablation": {row["variant"]: row for row in storage.read_json(study)["rows"]}}
+    notes: dict[str, str] = {}
+    generation = {}
+    for size in config.transformers:
+        scores = read_generation(f"{size}-precision")
+        sides = scores.get("sets", {})
+        scores["fid_small"] = scores.get("fid")
+        for side in sides.values():
+            side["fid_small"] = side.get("fid")
+        whole = home_path("evaluations", f"{size}-fid", "metrics.json")
+        if storage.exists(whole):
+            names = ("fid", "inception_score")
+            scores |= {name: value for name, value in read_generation(f"{size}-fid").items() if name in names}
+            for side in sides.values():
+                side.pop("fid", None)
+            notes["fid"] = "all training scenes; the test split is too small for a ceiling of the same size"
+            notes["inception_score"] = "of all generated scenes; ceiling and control: of 1,000"
+        else:
+            count = f"{scores['scenes']['generated']} scenes instead of {PAPER_SCENES:,}"
+            notes |= dict.fromkeys(("precision_k3", "recall_k3", "fid", "inception_score"), count)
+        if "sets" not in scores:
+            notes |= dict.fromkeys(("precision_k3", "recall_k3", "fid_small"), "too few test scenes for a ceiling")
+        generation[size] = scores
+    return Reproduced({"ours": ours} | storage.read_json(path), generation, notes)
+
+
+def read_generation(name: str) -> dict:
+    """Return the generation scores of an evaluation."""
+    return storage.read_json(home_path("evaluations", name, "metrics.json"))["generation"]

@@ -1,0 +1,80 @@
+#!/usr/bin/env python3
+"""Train and evaluate the paper's models on your data, and write the paper's tables with both numbers.
+
+    jobs/reproduce_paper.py kitti360 --input KITTI-360 --dry-run          the plan, with times and disk space
+    jobs/reproduce_paper.py kitti360 --input KITTI-360 --num-workers 4 --inception FILE
+    jobs/reproduce_paper.py av2 --input ARGOVERSE2 --num-workers 4 --inception FILE
+    jobs/reproduce_paper.py kitti360 --input KITTI-360 --scale mini      a rehearsal on two cores: small networks
+
+The job preprocesses the drives, trains the layout VAE, encodes latents, trains the transformers, samples scenes and
+evaluates them. It writes tables.html, tables.md and tables.json. In each row, the paper's number stands next to the
+reproduced one, its ceiling (real scenes) and a control (damaged scenes). First it prints the plan: the command of each
+stage, its time and the disk space. Run the same command again to resume after an interruption.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import tyro
+
+from jobs.support.cli import run
+from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, WaitForResourcesOption
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of both datasets."""
+
+    input: str
+    """Root directory of the raw dataset."""
+    scale: Literal["paper", "mini"] = "paper"
+    """Size of the networks and number of steps: as in the paper, or a rehearsal of minutes without a GPU."""
+    output: str = ""
+    """Directory to write all files to: data, runs, models, MLflow, tables (default: $PRITTI_HOME/paper-<dataset>)."""
+    dry_run: bool = False
+    """Print the plan and stop."""
+    transformers: tuple[Literal["b", "l", "xl"], ...] = ("b",)
+    """Transformers to train: DiT-B, DiT-L, DiT-XL. With --scale mini, all have the same small network."""
+    ablations: bool = False
+    """Also train the layout VAE without latent split, without objects and without ground, for Tab. 2."""
+    inception: str = ""
+    """File of Inception weights for precision, recall, FID and Inception score (default: none)."""
+    vgg16: str = ""
+    """File of VGG16 weights for the analysis of memorisation (default: none)."""
+    num_workers: int = 1
+    """Number of training workers and of models that run in parallel; use one per GPU."""
+    lvae_steps: int | None = None
+    """Number of training steps of the layout VAE (default: as in the preset)."""
+    dit_steps: int | None = None
+    """Number of training steps of each transformer (default: as in the preset)."""
+    num_scenes: int | None = None
+    """Number of scenes to generate per transformer (default: one per training scene, as in the paper; mini: 96)."""
+    num_inference_steps: int = 250
+    """Number of denoising steps (paper: 250)."""
+    skip_unreadable: bool = False
+    """Skip unreadable drives and list them in rejects; without this option, the job stops."""
+    seed: int = 0
+    """Random seed."""
+    gpus: GpusOption = None
+    wait_for_resources_s: WaitForResourcesOption = 0.0
+    if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
+
+
+@dataclass(frozen=True)
+class Kitti360(Options):
+    """Reproduce the tables of KITTI-360: voxels, boxes and generation (Tab. 1 to 3 of the paper)."""
+
+
+@dataclass(frozen=True)
+class Av2(Options):
+    """Reproduce the table of Argoverse 2 (supplement); --input holds train/ and val/ of the sensor dataset."""
+
+
+Config = Annotated[Kitti360, tyro.conf.subcommand("kitti360")] | Annotated[Av2, tyro.conf.subcommand("av2")]
+
+
+if __name__ == "__main__":
+    run("reproduce_paper")
