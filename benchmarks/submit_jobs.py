@@ -29,6 +29,8 @@ from chaos import open_store
 from common import describe_machine
 from raylets import RAY, ROOT, Cluster
 
+from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
+
 HOME = "s3://tests/home"
 JOB_TIMEOUT_S = 900
 SHOWN = 2  # Number of lines of each output.
@@ -63,6 +65,7 @@ sweep_seams --model town --input @/town --max-scenes 1 --settings 4 1 1 1 0
 sweep_references --real @/datasets/town --generated @/town --reference-sizes 8 --min-distances-m 1 --k 3
 ablate_lvae encoding --train-sizes 64 --any-footprint-train-sizes 64 --yaw-only-train-sizes 64 --num-seeds 1 --epochs 1
 run_demo --preset smoke --output @/demo
+reproduce_paper kitti360 --input RAW --scale mini --lvae-steps 4 --dit-steps 4 --num-scenes 12 --output @/paper
 serve_studio --datasets @/town --port 8600
 """
 
@@ -145,6 +148,8 @@ def run_jobs(config: Config, folder: Path, failed: list[str]) -> Iterator[str]:
         runtime["excludes"] += ["build", "docs"]
         settings.write_text(yaml.safe_dump(runtime))
         settings.chmod(0o600)
+        raw = folder / "raw"
+        write_kitti360(generate_town(3), raw)
         for line in JOBS.strip().splitlines():
             job, *words = line.split()
             if config.jobs and job not in config.jobs:
@@ -152,7 +157,7 @@ def run_jobs(config: Config, folder: Path, failed: list[str]) -> Iterator[str]:
             if job == "paint_streets" and not (config.diffusion and config.controlnet):
                 yield "# paint_streets: left out, because --diffusion and --controlnet are missing\n"
                 continue
-            models = {"DIFFUSION": config.diffusion, "CONTROLNET": config.controlnet}
+            models = {"DIFFUSION": config.diffusion, "CONTROLNET": config.controlnet, "RAW": str(raw)}
             shown = [f"jobs/{job}.py", *(word.replace("@", "$PRITTI_HOME") for word in words)]
             words = [f"jobs/{job}.py", *(models.get(word, word.replace("@", HOME)) for word in words)]
             run = submit_studio if job == "serve_studio" else submit_and_wait

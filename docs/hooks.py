@@ -181,8 +181,30 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
+def find_line(name: str) -> str:
+    """Return file and line of a module, class, function or method, such as models/lvae.py:40.
+
+    Raises:
+        ValueError: The package has no such name.
+    """
+    words = name.split(".")
+    count = next((k for k in range(len(words), 0, -1) if (ROOT / "/".join(words[:k])).with_suffix(".py").exists()), 0)
+    path = (ROOT / "/".join(words[:count])).with_suffix(".py")
+    if not count:
+        raise ValueError(f"{name}: no such module")
+    body, line = ast.parse(path.read_text()).body, 1
+    for word in words[count:]:
+        found = next((node for node in body if getattr(node, "name", None) == word), None)
+        if not isinstance(found, ast.FunctionDef | ast.ClassDef):
+            raise ValueError(f"{name}: {path.relative_to(ROOT)} has no {word}")
+        body, line = found.body, found.lineno
+    return f"{path.relative_to(ROOT)}:{line}"
+
+
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Link to the executed page of a notebook, and drop the comments that tests read."""
+    """Link to the executed page of a notebook, drop the comments that tests read, and add lines of code to paper.md."""
+    if page.file.src_uri == "reference/paper.md":
+        markdown = re.sub(r"\[`([\w.]+)`\]\[\]", lambda m: f"{m[0]} ({find_line(m[1])})", markdown)
     return re.sub(r"^<!-- (test|needs): .*-->\n", "", markdown.replace(".ipynb)", ".md)"), flags=re.MULTILINE)
 
 

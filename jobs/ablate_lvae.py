@@ -61,7 +61,7 @@ class Branches:
     """
 
     preset: tyro.conf.Positional[str] = "town"
-    """Preset: smoke, demo, town, kitti360, kitti360-light or av2."""
+    """Preset: smoke, demo, town, kitti360, kitti360-mini, kitti360-light or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     minutes: float = 10.0
@@ -95,7 +95,7 @@ class Decoders(Branches):
     """Compare the cell decoder with the paper's DETR decoder, with and without shortcuts, for equal training time."""
 
     preset: tyro.conf.Positional[str] = "demo"
-    """Preset: smoke, demo, town, kitti360, kitti360-light or av2."""
+    """Preset: smoke, demo, town, kitti360, kitti360-mini, kitti360-light or av2."""
     num_checkpoints: int = 12
     """Number of checkpoints per training run; the validation at each checkpoint gives one point of a curve."""
     name: str = "decoders"

@@ -45,9 +45,10 @@ class Config(RePaintOptions):
     order: Literal["outward", "colours"] = "outward"
     """Order of blocks: outward from the scene (the paper), or four groups of independent blocks (needs --overlap <
     0.5)."""
-    neighbour_latents: Literal["reencode", "copy", "paper"] = "reencode"
+    neighbour_latents: Literal["reencode", "copy", "paper"] | None = None
     """How a block uses its neighbours: reencode encodes them again in the frame of the block, copy copies and shifts
-    their latents. paper does the same as copy, but without blending the ground and without removing duplicates."""
+    their latents. paper does the same as copy, but without blending the ground and without removing duplicates
+    (default: as the model stores; paper for the paper's presets, else reencode)."""
     batch_size: int = 4
     """Number of blocks of a scene per batch; the batch size changes the result only by rounding."""
 

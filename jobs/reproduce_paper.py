@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Train and evaluate the paper's models on your data, and write the paper's tables with both numbers.
+"""Train and evaluate the paper's models, and write the paper's tables next to its numbers.
 
     jobs/reproduce_paper.py kitti360 --input KITTI-360 --dry-run          the plan, with times and disk space
     jobs/reproduce_paper.py kitti360 --input KITTI-360 --num-workers 4 --inception FILE

@@ -26,7 +26,7 @@ class Config:
     """Options of a training run; options that are not given have the values of the preset (models/presets.py)."""
 
     preset: tyro.conf.Positional[str] = "town"
-    """Preset: smoke, demo, town, kitti360, kitti360-l, kitti360-xl or av2."""
+    """Preset: smoke, demo, town, kitti360-mini, kitti360, kitti360-l, kitti360-xl or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     latents: str = ""

@@ -26,7 +26,7 @@ from models.execution import SamplingExecution
 from models.labels import find_label_index, split_label
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.options import Number, Rule, Sequential, Text, check_entries, show_value
+from models.options import Choice, Number, Rule, Sequential, Text, check_entries, show_value
 from models.pretrained import INDEX_NAME, find_pipeline_path
 from models.sampling.diffusion import (
     GENERATE,
@@ -49,11 +49,13 @@ from models.scene import Scene
 from models.tensors import EXISTENCE_THRESHOLD, decode_layout, make_empty_scene, make_layout_batch
 
 COMPONENTS = {"lvae": LayoutVAE, "dit": DiT}
+NEIGHBOUR_LATENTS = ("reencode", "copy", "paper")
 SCHEDULER_CONFIG = "scheduler/scheduler_config.json"
 INDEX_RULES: dict[str, Rule] = {
     **dict.fromkeys((*COMPONENTS, "scheduler"), Sequential(Text(), 2, 2)),
     "noise_scaling": Number(0.9, 1.1),
     "existence_threshold": Number(0, 1),
+    "neighbour_latents": Choice(NEIGHBOUR_LATENTS),
 }
 
 
@@ -113,6 +115,8 @@ class PrITTIPipeline:
         noise_scaling: Divisor of the predicted noise (`diffusion.scale_noise`) for all samplers except DDPM. The paper
             does not scale the noise.
         existence_threshold: Only primitives with a higher existence probability are kept; the paper uses 0.3.
+        neighbour_latents: How outpainting uses neighbouring blocks by default: "reencode", "copy" or "paper"
+            (jobs/outpaint_scenes.py).
 
     Raises:
         ValueError: The LayoutSpec or the shape of the latents of the DiT differs from that of `lvae`, or the noise
@@ -126,12 +130,15 @@ class PrITTIPipeline:
         scheduler: Any = None,
         noise_scaling: float = 1.0,
         existence_threshold: float = EXISTENCE_THRESHOLD,
+        neighbour_latents: str = "reencode",
     ) -> None:
         self.lvae, self.dit = lvae.eval().requires_grad_(False), dit.eval().requires_grad_(False)
         self.scheduler = SchedulerConfig.ddpm(dit.diffusion)
         if scheduler is not None:
             self.scheduler = scheduler
-        self.config = Config(noise_scaling=noise_scaling, existence_threshold=existence_threshold)
+        self.config = Config(
+            noise_scaling=noise_scaling, existence_threshold=existence_threshold, neighbour_latents=neighbour_latents
+        )
         self.execution = SamplingExecution()
         self._progress_bar: dict[str, Any] = {}
         if dit.config.layout is not None:
@@ -172,7 +179,8 @@ class PrITTIPipeline:
         except ValueError as error:
             raise ValueError(f"{path / SCHEDULER_CONFIG}: {error}") from error
         components = {name: kind.from_pretrained(path / name, torch_dtype) for name, kind in COMPONENTS.items()}
-        thresholds = {name: index[name] for name in ("noise_scaling", "existence_threshold") if name in index}
+        names = ("noise_scaling", "existence_threshold", "neighbour_latents")
+        thresholds = {name: index[name] for name in names if name in index}
         try:
             return cls(**components, scheduler=scheduler, **thresholds)
         except ValueError as error:
@@ -251,7 +259,7 @@ class PrITTIPipeline:
         self.scheduler_config.require_schedule(self.dit.diffusion)
 
     def register_to_config(self, **changes: Any) -> None:
-        """Replace `noise_scaling` or `existence_threshold`.
+        """Replace `noise_scaling`, `existence_threshold` or `neighbour_latents`.
 
         Args:
             **changes: New values by name.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, fields
+from typing import Any
 
 from jobs.ablate_lvae import Branches
 from jobs.encode_latents import Config as EncodeConfig
@@ -141,7 +142,7 @@ def count_scenes(config: Options, counts: Counts) -> int:
 def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
     source, mini, workers = find_source(config), config.scale == "mini", config.num_workers
     data, total = home_path("datasets", source), counts.train + counts.test
-    shared = {"gpus": config.gpus, "wait_for_resources_s": config.wait_for_resources_s, "if_busy": config.if_busy}
+    shared: dict[str, Any] = {"gpus": config.gpus, "wait_for_resources_s": config.wait_for_resources_s, "if_busy": config.if_busy}
     cores = "measured on two cores"
     yield Stage(
         "preprocess the drives",
@@ -242,10 +243,10 @@ def _list_transformer_stages(config: Options, counts: Counts, size: str, data: s
         scenes * GENERATED_BYTES / 1e9,
         cores if mini else f"the paper's {per_scene:g} s per scene on one A100",
     )
-    common = {"real": data, "generated": home_path("generated"), "run": size, "inception": config.inception}
+    common: dict[str, Any] = {"real": data, "generated": home_path("generated"), "run": size, "inception": config.inception}
     common |= {"num_actors": workers, **shared}
     hours = 2 * EVALUATE_S * min(scenes, PAPER_SCENES) / 2 / 3600
-    limits = {"max_scenes": min(scenes, counts.train)} if mini else {"protocol": "paper-pr"}
+    limits: dict[str, Any] = {"max_scenes": min(scenes, counts.train)} if mini else {"protocol": "paper-pr"}
     yield Stage(
         f"evaluate the scenes of {title}",
         "evaluate_scenes",

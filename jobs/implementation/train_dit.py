@@ -89,7 +89,8 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
         log_every=max(1, min(50, settings.steps // 50)),
         validate=SamplingCheck(root, dataset.source, latents_root, latents["lvae"], label_kind),
     )
-    return training, partial(complete_pipeline, latents["lvae"], start.sampling if start else {})
+    sampling = (start.sampling if start else {}) | {"neighbour_latents": row.neighbour_latents}
+    return training, partial(complete_pipeline, latents["lvae"], sampling)
 
 
 def check_training_labels(shards: list[Shard], kind: str) -> None:
@@ -276,7 +277,7 @@ def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
 
     Args:
         lvae: Directory of the layout VAE.
-        sampling: Values of `noise_scaling` and `existence_threshold`, if the values differ from the paper's.
+        sampling: Values of `noise_scaling`, `existence_threshold` and `neighbour_latents`.
         output: Directory that contains dit/. This directory is also returned.
     """
     dit = DiT.from_pretrained(storage.join_uri(output, "dit"))

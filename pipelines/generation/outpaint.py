@@ -53,7 +53,7 @@ class OutpaintRequest(Request):
         label: Label of the generated blocks. None: the label of each scene is used.
         seed: Seed of the noise.
         overlap: Overlap of neighbouring blocks as a fraction of a block.
-        mode: Outpainting mode of `generate_blocks`.
+        mode: Outpainting mode of `generate_blocks`. None: the mode that the pipeline stores.
         repaint: RePaint options.
         guidance_scale: Scale of classifier-free guidance.
         num_blocks: Four numbers of blocks to generate: ahead, behind, to the left, to the right.
@@ -64,7 +64,7 @@ class OutpaintRequest(Request):
     label: str | None
     seed: int
     overlap: float
-    mode: str
+    mode: str | None
     repaint: RePaintConfig
     guidance_scale: float
     num_blocks: tuple[int, int, int, int] = (1, 1, 1, 1)
@@ -267,7 +267,7 @@ class Outpainter:
             request.label or find_scene_label(given, self.pipeline.dit.config.label),
             request.seed,
             batch.number,
-            request.mode,
+            request.mode or self.pipeline.config.neighbour_latents,
             request.repaint,
             request.guidance_scale,
         )
@@ -337,6 +337,7 @@ def outpaint_scenes(
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
+    request = replace(request, mode=request.mode or pipeline.config.neighbour_latents)
     block_grid = request.make_block_grid(pipeline.latent_shape[-1])
     parts = [storage.join_uri(request.output, "blocks", request.run)]
     guard_generation_run(request, pipeline, parts, input=asdict(selection), scenes=selection.files())

@@ -299,7 +299,7 @@ def test_repeated_key_is_found_in_linear_time():
     start = time.perf_counter()
     with pytest.raises(ValueError, match="'99999' occurs twice"):
         parse_json(text.encode())
-    assert time.perf_counter() - start < 2
+    assert time.perf_counter() - start < 20  # A quadratic search would take minutes.
 
 
 def test_label_kind_of_damaged_config_is_named(directory):

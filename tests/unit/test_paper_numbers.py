@@ -1,7 +1,7 @@
 """Test that the paper's presets and constants have the numbers of docs/reference/paper.md."""
 
 import ast
-import importlib
+import importlib.util
 import re
 from typing import Any
 
@@ -14,7 +14,9 @@ from models.lvae import LayoutVAE
 from models.presets import DIT_PRESETS, LVAE_PRESETS
 
 ROW = re.compile(r"^\| ([^|]+) \| ([^|]+) \| `([^`]+)` \| ([^|]+) \|$", re.M)
-ROWS = ROW.findall((ROOT / "docs/reference/paper.md").read_text())
+PAGE = (ROOT / "docs/reference/paper.md").read_text()
+NUMBERS = PAGE.partition("\n## Numbers\n")[2]
+ROWS = ROW.findall(NUMBERS)
 
 
 def make_lvae() -> LayoutVAE:
@@ -36,8 +38,7 @@ def list_names() -> dict[str, Any]:
 
 def test_page_lists_the_paper():
     assert len(ROWS) > 50
-    page = (ROOT / "docs/reference/paper.md").read_text()
-    assert page.count("\n| ") - page.count("\n| quantity |") == len(ROWS)  # Each row has a field.
+    assert NUMBERS.count("\n| ") - NUMBERS.count("\n| quantity |") == len(ROWS)  # Each row has a field.
 
 
 @pytest.mark.parametrize(("quantity", "value", "field", "place"), ROWS, ids=[row[0] for row in ROWS])
@@ -48,3 +49,18 @@ def test_field_has_the_number_of_the_paper(quantity, value, field, place):
 def test_av2_has_the_networks_of_the_paper():
     assert LVAE_PRESETS["av2"].model == LVAE_PRESETS["kitti360"].model
     assert DIT_PRESETS["av2"].model == DIT_PRESETS["kitti360"].model
+
+
+def test_page_links_each_mechanism_to_a_line_of_code():
+    path = ROOT / "docs/hooks.py"
+    loaded = importlib.util.spec_from_file_location("hooks", path)
+    hooks = importlib.util.module_from_spec(loaded)
+    loaded.loader.exec_module(hooks)
+    names = re.findall(r"\[`((?:models|pipelines)[\w.]+)`\]\[\]", PAGE.partition("## Deviations")[0])
+    assert len(names) > 35
+    for name in names:
+        path, line = hooks.find_line(name).split(":")
+        text = (ROOT / path).read_text().splitlines()[int(line) - 1]
+        assert line == "1" or re.match(rf"\s*(class|def) {name.rpartition('.')[2]}\b", text), name
+    with pytest.raises(ValueError, match=r"models/lvae\.py has no LayoutGAN"):
+        hooks.find_line("models.lvae.LayoutGAN")

@@ -68,7 +68,7 @@ def test_poses_of_town_drive_are_counted_before_preprocessing(tmp_path):
         count_poses(replace(config, scale="paper"))
 
 
-def test_missing_parts_of_datasets_are_found_before_preprocessing(tmp_path):
+def test_missing_parts_of_datasets_are_found_first(tmp_path):
     for name in ("train", "val"):
         (tmp_path / name).mkdir()
     with pytest.raises(ValueError, match=r"data_3d_bboxes"):
