@@ -142,7 +142,8 @@ def count_scenes(config: Options, counts: Counts) -> int:
 def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
     source, mini, workers = find_source(config), config.scale == "mini", config.num_workers
     data, total = home_path("datasets", source), counts.train + counts.test
-    shared: dict[str, Any] = {"gpus": config.gpus, "wait_for_resources_s": config.wait_for_resources_s, "if_busy": config.if_busy}
+    names = ("gpus", "wait_for_resources_s", "if_busy")
+    shared: dict[str, Any] = {name: getattr(config, name) for name in names}
     cores = "measured on two cores"
     yield Stage(
         "preprocess the drives",
@@ -188,11 +189,11 @@ def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
         cores,
     )
     if config.ablations:
-        names = ("without latent split", "without objects", "without ground")
+        variants = ("without latent split", "without objects", "without ground")
         yield Stage(
             "train the ablations of the layout VAE",
             "ablate_lvae",
-            Branches(preset, data, steps=steps, num_seeds=1, only_variants=names, num_workers=workers, **shared),
+            Branches(preset, data, steps=steps, num_seeds=1, only_variants=variants, num_workers=workers, **shared),
             3 * (steps * MINI_LVAE_STEP_S / 3600 if mini else share * PAPER_LVAE_GPU_H / workers),
             3 * weights * BYTES_PER_WEIGHT * KEPT_CHECKPOINTS / 1e9,
             cores if mini else f"the paper's {PAPER_LVAE_GPU_H:g} hours on one A100 per variant",
@@ -243,8 +244,8 @@ def _list_transformer_stages(config: Options, counts: Counts, size: str, data: s
         scenes * GENERATED_BYTES / 1e9,
         cores if mini else f"the paper's {per_scene:g} s per scene on one A100",
     )
-    common: dict[str, Any] = {"real": data, "generated": home_path("generated"), "run": size, "inception": config.inception}
-    common |= {"num_actors": workers, **shared}
+    common: dict[str, Any] = {"real": data, "generated": home_path("generated"), "run": size}
+    common |= {"inception": config.inception, "num_actors": workers, **shared}
     hours = 2 * EVALUATE_S * min(scenes, PAPER_SCENES) / 2 / 3600
     limits: dict[str, Any] = {"max_scenes": min(scenes, counts.train)} if mini else {"protocol": "paper-pr"}
     yield Stage(
