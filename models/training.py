@@ -27,6 +27,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from models.base import ConfiguredModel
 from models.batch import LayoutBatch
 from models.dit import DiT
+from models.execution import require_bf16
 from models.layout import FEATURES, LayoutSpec
 from models.lvae import LayoutVAE
 from models.sampling.diffusion import finish_drawing, make_keyed_generator, start_drawing
@@ -289,6 +290,9 @@ class Trainer:
         wrapped: Module that is called instead of `model`, such as `model` wrapped in DistributedDataParallel. None:
             `model`.
         execution: Options of the execution; None: the defaults of `ExecutionConfig`.
+
+    Raises:
+        ValueError: The options ask for bfloat16, but the GPU has none.
     """
 
     def __init__(
@@ -302,6 +306,8 @@ class Trainer:
     ) -> None:
         self.model, self.wrapped, self.loss = model, wrapped or model, loss
         self.settings, self.device, self.execution = settings, device, execution or ExecutionConfig()
+        if self.execution.precision == "bf16":
+            require_bf16(device)
         self.parameters = {name: p for name, p in model.named_parameters() if p.requires_grad}
         # Maps prefixes of parameter names to factors of the learning rate.
         rates = getattr(model, "learning_rate_factors", dict)()

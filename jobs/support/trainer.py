@@ -33,7 +33,7 @@ from jobs.support.ray_session import run_packed, start_ray
 from jobs.support.tracking import Tracker
 from models.training import NonFiniteLossError, OptimizerConfig, Trainer
 from pipelines.runtime import storage
-from pipelines.runtime.resources import count_gpus_per_model, count_room, require_room
+from pipelines.runtime.resources import count_gpus_per_model, count_room, find_device, require_room
 from pipelines.schema.run_guard import guard_options
 from pipelines.training.data_loader import READER_CPUS, Reader, Stream, iterate_batches, split_batch
 from pipelines.training.latents import digest_weights
@@ -88,6 +88,7 @@ def train_worker(run: TrainingRun) -> None:
     context = ray.train.get_context()
     rank, world = context.get_world_rank(), context.get_world_size()
     torch.set_num_threads(count_threads(context.get_local_world_size()))
+    find_device()  # Raises an error if torch cannot use an assigned GPU; Ray Train would train on the CPU.
     device = ray.train.torch.get_device()
     wrap = ray.train.torch.prepare_model if world > 1 else lambda model: model
     trainer = run.build(device, wrap)

@@ -98,11 +98,22 @@ def find_device() -> str:
         if not torch.cuda.is_available():
             raise ValueError(
                 f"node {ray.util.get_node_ip_address()}: Ray assigned GPU {', '.join(assigned)}, but torch"
-                f" {torch.__version__} finds no CUDA device; install torch with CUDA and a driver on this node, or use"
-                " --gpus 0"
+                f" {torch.__version__} finds no CUDA device ({explain_missing_cuda()}); install torch with CUDA and a"
+                " driver for it on this node, or use --gpus 0"
             )
         return "cuda"
     return "cuda" if torch.cuda.is_available() and get_resource_policy().gpus != 0 else "cpu"
+
+
+def explain_missing_cuda() -> str:
+    """Return torch's reason why it cannot use CUDA, such as a driver that is too old."""
+    import torch
+
+    try:
+        torch.cuda.current_device()
+    except (RuntimeError, AssertionError) as error:
+        return str(error).partition(". ")[0]
+    return "no reason is known"
 
 
 def make_model_resources(num_cpus: float = 1.0) -> dict[str, float]:

@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from jobs.support.trainer import describe_fitting_batch
-from models.training import ExecutionConfig
+from models.dit import DiT
+from models.training import ExecutionConfig, OptimizerConfig, Trainer
 from pipelines.generation.sample import Sampler
+from pipelines.runtime.resources import explain_missing_cuda
 
 BATCH = {"height": np.zeros((30, 2), np.float32)}
 
@@ -48,3 +50,21 @@ def test_sampling_names_a_smaller_batch():
     sampler.pipeline = SimpleNamespace(generate=generate, device="cuda:0")  # type: ignore[assignment]
     with pytest.raises(ValueError, match="16 scenes do not fit into the memory of cuda:0; use a --batch-size below 16"):
         sampler.generate(range(16))
+
+
+def test_training_in_bf16_is_refused_without_bf16(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: False)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Tesla V100")
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: (7, 0))
+    settings, device = OptimizerConfig(steps=1, learning_rate=1e-3, weight_decay=0.0), torch.device("cuda")
+    execution = ExecutionConfig(precision="bf16")
+    with pytest.raises(ValueError, match=r"Tesla V100 .* has no bfloat16, .* --precision fp32"):
+        Trainer(DiT(patch=2, depth=1, width=32, heads=2), lambda *_: {}, settings, device, None, execution)
+
+
+def test_old_driver_is_named(monkeypatch):
+    def fail() -> None:
+        raise RuntimeError("The NVIDIA driver on your system is too old (found version 11040). Please update it.")
+
+    monkeypatch.setattr(torch.cuda, "current_device", fail)
+    assert explain_missing_cuda() == "The NVIDIA driver on your system is too old (found version 11040)"
