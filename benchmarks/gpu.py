@@ -43,12 +43,16 @@ import numpy as np
 import torch
 from safetensors.numpy import load_file, save_file
 
+from models.batch import LayoutBatch
 from models.dit import DiT
 from models.execution import SamplingExecution, require_bf16
+from models.geometry.cholesky import decode_cholesky_boxes
+from models.geometry.iou3d import compute_iou3d_pairs, make_boxes
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTConfig, DiTPreset, LVAEPreset
+from models.tensors import EXISTENCE_THRESHOLD
 from models.training import (
     ExecutionConfig,
     OptimizerConfig,
@@ -58,11 +62,13 @@ from models.training import (
     make_lvae_trainer,
 )
 from models.vae import losses
+from models.vae.matching import MatchWeights, match_primitives
 
 ROOT = Path(__file__).parents[1]
 SECTION_SECONDS = 480.0
 FIELDS = ("height", "occupied", "features", "real")
 MAX_SCENES_BYTES = 20_000_000
+HELD_OUT = 16  # Scenes of `learn` that are not trained on.
 DIT_NAMES = {"kitti360": "DiT-B", "kitti360-l": "DiT-L", "kitti360-xl": "DiT-XL"}
 # One scene of DiT-B with 250 steps.
 PAPER_LATENCY, TARGET_LATENCY, TARGET_MEMORY = "0.58 (A100)", "<= 0.15", "<= 0.6"
@@ -322,8 +328,14 @@ class Layouts:
             "real": np.tile(real, (count, 1)),
         }
 
+        self.held = min(HELD_OUT, len(self.arrays["real"]) // 4)
+
     def __len__(self) -> int:
-        return len(self.arrays["real"])
+        return len(self.arrays["real"]) - self.held
+
+    def draw_held_out(self) -> dict[str, torch.Tensor]:
+        """Return the scenes that are never drawn for training."""
+        return {name: torch.from_numpy(value[len(self) :]).to(self.device) for name, value in self.arrays.items()}
 
     def draw(self, step: int, batch: int) -> dict[str, torch.Tensor]:
         """Return a batch of a step; every epoch has another order."""
@@ -358,11 +370,9 @@ def make_dit_for_training(setup: Setup, precision: str, compiled: bool = False) 
 
 
 def make_lvae_for_training(setup: Setup, precision: str, steps: int = 0, batch: dict | None = None) -> Trainer:
-    from models.batch import LayoutBatch
-
     row, lvae = setup.lvae_preset("kitti360"), setup.make_lvae("kitti360")
     lvae.to(setup.device)
-    if batch is not None:
+    if batch is not None and row.init_from_data:
         lvae.init_from_data(LayoutBatch.from_compact(batch))
     settings = OptimizerConfig(steps or row.steps, row.learning_rate, row.weight_decay, row.final_learning_rate)
     return make_lvae_trainer(
@@ -479,6 +489,42 @@ def run_precision(setup: Setup) -> Iterator[Row]:
         )
 
 
+@torch.no_grad()
+def measure_primitives(model: LayoutVAE, arrays: dict[str, torch.Tensor]) -> dict[str, float]:
+    """Compare the primitives of layouts with those that the model reconstructs from the latent mean.
+
+    Returns:
+        Median distance of matched centres (m), shares of the true primitives and of the proposals with an existence
+        probability above 0.3 that have a counterpart within 1 m, and mean IoU3D of the matched boxes.
+    """
+    spec, batch = model.spec, LayoutBatch.from_compact(arrays)
+    output = model.decode(model.encode(batch).mean).float()
+    found = match_primitives(
+        output.features,
+        output.existence_logit,
+        batch.features,
+        batch.real,
+        spec.slots,
+        output.proposals,
+        MatchWeights(existence=0.0),
+    )
+    sample, proposal = (found >= 0).nonzero(as_tuple=True)
+    boxes = []
+    for features in (output.features[sample, proposal], batch.features[sample, found[sample, proposal]]):
+        values = features.double().cpu().numpy()
+        center_m = spec.center_bounds_m.restore(values[:, :3])
+        boxes.append(make_boxes(center_m, *decode_cholesky_boxes(spec.cholesky_bounds.restore(values[:, 3:]))))
+    distance_m = np.linalg.norm(boxes[0].center_m - boxes[1].center_m, axis=1)
+    likely = output.existence_logit.sigmoid() > EXISTENCE_THRESHOLD
+    right = (distance_m < 1) & likely[sample, proposal].cpu().numpy()
+    return {
+        "median centre error (m)": float(np.median(distance_m)),
+        "primitives found within 1 m (%)": 100 * float(right.sum() / max(len(right), 1)),
+        "proposals within 1 m of a primitive (%)": 100 * float(right.sum() / max(int(likely.sum()), 1)),
+        "IoU3D of matched primitives (%)": 100 * float(compute_iou3d_pairs(*boxes).mean()),
+    }
+
+
 def run_learn(setup: Setup) -> Iterator[Row]:
     """Train a layout VAE on the scenes for at most SECTION_SECONDS, from the last checkpoint."""
     if not setup.scenes and not setup.tiny:
@@ -505,6 +551,9 @@ def run_learn(setup: Setup) -> Iterator[Row]:
     for name in ("loss", "center", "cholesky", "existence", "occupancy"):
         if curve:
             yield Row(f"learn, {name} after {trainer.steps_done} steps", curve[-1][1][name], "")
+    trainer.model.eval()
+    for name, value in measure_primitives(trainer.model, layouts.draw_held_out()).items():
+        yield Row(f"learn, held out, {name} after {trainer.steps_done} steps", value, "")
     if done:
         yield Row(
             "learn, scenes per second",
