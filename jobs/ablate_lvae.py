@@ -4,6 +4,7 @@
     jobs/ablate_lvae.py encoding            Cholesky, quaternion and octahedral encodings, on synthetic boxes
     jobs/ablate_lvae.py branches            without latent split, objects or ground, on $PRITTI_HOME/datasets/town
     jobs/ablate_lvae.py decoders            the cell decoder and the paper's DETR decoder, at equal time
+    jobs/ablate_lvae.py detr --dataset DIR  changes of the paper's DETR decoder, each alone, at equal time
     jobs/ablate_lvae.py ground              sizes of the ground branch, at equal time
     jobs/ablate_lvae.py augmentation        mirrored scenes and moved vehicles
     jobs/ablate_lvae.py branches --dataset DIR --minutes 60 --num-seeds 5
@@ -103,6 +104,20 @@ class Decoders(Branches):
 
 
 @dataclass(frozen=True)
+class Detr(Branches):
+    """Compare changes of the paper's DETR decoder, each alone and with only the object branch, for equal time."""
+
+    preset: tyro.conf.Positional[str] = "kitti360-mini"
+    """Preset with a DETR decoder: smoke, kitti360, kitti360-mini or av2."""
+    minutes: float = 20.0
+    """Training time in minutes; a speed measurement converts it to steps per variant."""
+    num_seeds: int = 1
+    """Number of seeds; every variant is trained with seed 0, then every variant with seed 1, and so on."""
+    name: str = "detr"
+    """Name of the study and of its runs."""
+
+
+@dataclass(frozen=True)
 class Ground(Branches):
     """Compare sizes of the ground branch, from 1/100 of the paper's size to the full size, for equal training time."""
 
@@ -124,6 +139,7 @@ Config = (
     Annotated[Encoding, tyro.conf.subcommand("encoding")]
     | Annotated[Branches, tyro.conf.subcommand("branches")]
     | Annotated[Decoders, tyro.conf.subcommand("decoders")]
+    | Annotated[Detr, tyro.conf.subcommand("detr")]
     | Annotated[Ground, tyro.conf.subcommand("ground")]
     | Annotated[Augmentation, tyro.conf.subcommand("augmentation")]
 )

@@ -15,7 +15,7 @@ from statistics import median
 import pyarrow as pa
 import torch
 
-from jobs.ablate_lvae import Augmentation, Branches, Decoders, Encoding, Ground
+from jobs.ablate_lvae import Augmentation, Branches, Decoders, Detr, Encoding, Ground
 from jobs.implementation.train_lvae import prepare
 from jobs.support.cli import resolve_path
 from jobs.support.outputs import hold_output
@@ -176,6 +176,7 @@ def select_variants(config: Branches) -> dict[str, Variant]:
     studies = {
         Branches: ablation.BRANCHES,
         Decoders: ablation.DECODERS,
+        Detr: ablation.DETR_CHANGES,
         Ground: ablation.GROUND,
         Augmentation: ablation.AUGMENTATIONS,
     }
@@ -189,7 +190,7 @@ def select_variants(config: Branches) -> dict[str, Variant]:
 
 def is_at_equal_time(config: Branches) -> bool:
     """Return True if the variants train for the same time, and False if they train for the same number of steps."""
-    return isinstance(config, Decoders | Ground)
+    return isinstance(config, Decoders | Detr | Ground)
 
 
 def make_slug(variant: str) -> str:

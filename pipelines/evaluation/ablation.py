@@ -276,12 +276,34 @@ BRANCHES = {
     "without objects": Variant({"branches": "ground"}),
     "without ground": Variant({"branches": "objects"}),
 }
-# Both decoders use the same branches and latents. The paper's DETR decoder diverges at the learning rate of the cell
-# decoder.
+# Both decoders use the same branches, latents and unit of the losses (cells). The paper's DETR decoder diverges at the
+# learning rate of the cell decoder.
 DECODERS = {
     "cells": Variant({"objects": {"decoder": "cells"}}),
     "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
     "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
+}
+# Changes of the paper's DETR decoder, each alone. The models have only the object branch: with the latent split, the
+# branches share no weights and no losses.
+DETR_CHANGES = {
+    "the paper's DETR": Variant(),
+    "loss in metres": Variant({"objects": {"loss_unit": "metres"}}),
+    "loss in cells": Variant({"objects": {"loss_unit": "cells"}}),
+    "learning rate 3e-4": Variant(options={"learning_rate": 3e-4}),
+    "learning rate 3e-3": Variant(options={"learning_rate": 3e-3}),
+    "warm-up": Variant(options={"warmup_steps": 200}),
+    "clipped gradients": Variant(options={"grad_clip": 1.0}),
+    "auxiliary losses": Variant({"objects": {"auxiliary_losses": True}}),
+    "learned contents": Variant({"objects": {"learned_content": True}}),
+    "positions per cell": Variant({"objects": {"position_unit": "cell"}}),
+    "anchors": Variant({"objects": {"queries": "anchors"}}),
+    "conditional attention": Variant({"objects": {"queries": "conditional"}}),
+    "denoising queries": Variant({"objects": {"denoising_groups": 1}}),
+    "random start": Variant(options={"init_from_data": False}),
+}
+DETR_CHANGES = {
+    name: Variant({"branches": "objects"} | dict(change.architecture), change.options)
+    for name, change in DETR_CHANGES.items()
 }
 # Variants with only the ground branch. The preset `town` has the options `pixel_unshuffle=8` and `channels=(32,)`.
 # With the option `shortcut`, the initial weights are a linear map from a principal component analysis of the data

@@ -15,6 +15,7 @@ from pipelines.evaluation.ablation import (
     AUGMENTATIONS,
     BRANCHES,
     DECODERS,
+    DETR_CHANGES,
     average_measurements,
 )
 
@@ -66,7 +67,7 @@ def test_encoding_study_writes_table_and_figure_and_resumes(empty_home, capsys):
 
 
 def test_variant_differs_from_preset_only_in_its_switch(empty_home):
-    from jobs.ablate_lvae import Augmentation, Branches, Decoders
+    from jobs.ablate_lvae import Augmentation, Branches, Decoders, Detr
     from jobs.implementation.ablate_lvae import prepare_variant
     from jobs.support.trainer import convert_to_tensors
     from pipelines.training.data_loader import read_samples
@@ -75,6 +76,7 @@ def test_variant_differs_from_preset_only_in_its_switch(empty_home):
         *((Branches(preset="smoke"), *item) for item in BRANCHES.items()),
         *((Decoders(preset="smoke"), *item) for item in DECODERS.items()),
         *((Augmentation(preset="smoke"), *item) for item in AUGMENTATIONS.items()),
+        *((Detr(preset="smoke"), *item) for item in DETR_CHANGES.items()),
     ):
         run = prepare_variant(config, variant, f"test-{variant}", seed=1, steps=3)
         trainer = run.build(torch.device("cpu"), lambda model: model)
