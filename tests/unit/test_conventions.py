@@ -25,3 +25,8 @@ def test_names_are_at_most_60_characters(folder):
     ]
     names = [node.name for node in functions if node.name.startswith("test_")]
     assert names and [name for name in names if len(name) > 60 or name.startswith(("test_a_", "test_the_"))] == []
+
+
+def test_jobs_are_executable():
+    paths = sorted((ROOT / "jobs").glob("[!_]*.py"))
+    assert len(paths) > 20 and [path.name for path in paths if not path.stat().st_mode & 0o111] == []
