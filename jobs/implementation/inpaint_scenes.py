@@ -7,7 +7,7 @@ from jobs.inpaint_scenes import Config
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
-from jobs.support.scene_requests import make_repaint_config, select_scenes
+from jobs.support.scene_requests import make_execution, make_repaint_config, select_scenes
 from pipelines.generation.inpaint import InpaintRequest, RegionConfig, inpaint_scenes
 
 
@@ -28,6 +28,7 @@ def inpaint(config: Config) -> dict[str, float | None]:
         label=config.label or None,
         seed=config.seed,
         repaint=make_repaint_config(config),
+        execution=make_execution(config),
         guidance_scale=config.guidance_scale,
     )
     with hold_output(request.output, request.source, config), JobProgress() as bar:

@@ -11,7 +11,7 @@ from jobs.outpaint_scenes import Config
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
-from jobs.support.scene_requests import make_repaint_config, select_scenes
+from jobs.support.scene_requests import make_execution, make_repaint_config, select_scenes
 from pipelines.generation.outpaint import HARDLY_KNOWN, OutpaintRequest, outpaint_scenes
 from pipelines.runtime import storage
 
@@ -58,6 +58,7 @@ def outpaint(config: Config) -> list[str]:
         overlap=config.overlap,
         mode=config.neighbour_latents,
         repaint=make_repaint_config(config),
+        execution=make_execution(config),
         guidance_scale=config.guidance_scale,
         num_blocks=counts,
         order=config.order,

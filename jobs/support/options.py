@@ -99,3 +99,9 @@ class RePaintOptions(GenerationOptions):
     """Weight of pseudoinverse guidance towards the known region (default: 0; 1 with --guided)."""
     eta: float | None = None
     """Share of DDPM's noise that a step adds, 0 to 1 (default: 1 as in the paper; 0.3 with --guided)."""
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """Precision of the transformer. bf16 is faster on GPUs and changes scenes by rounding."""
+    cuda_graphs: bool = False
+    """Replay each denoising step as one CUDA graph; not used in steps with pseudoinverse guidance or without a GPU."""
+    compile: bool = False
+    """Compile the transformer's block with torch.compile, which takes a minute; useful on GPUs."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from jobs.support.cli import resolve_path
 from jobs.support.options import RePaintOptions, SceneOptions
+from models.execution import SamplingExecution
 from models.sampling.repaint import RePaintConfig
 from pipelines.schema.scene_subset import SceneSubset
 
@@ -14,6 +15,11 @@ def select_scenes(options: SceneOptions) -> SceneSubset:
     """Return the subset of scenes that the options select."""
     directory = resolve_path(options.input, "generated")
     return SceneSubset(directory, options.source or None, options.split or None, options.max_scenes, "first")
+
+
+def make_execution(options: RePaintOptions) -> SamplingExecution:
+    """Return how the model runs."""
+    return SamplingExecution(options.precision, options.cuda_graphs, options.compile)
 
 
 def make_repaint_config(options: RePaintOptions) -> RePaintConfig:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import chain
 
 import numpy as np
 
 from models.composition.extend import inpaint_blocks, split_region
 from models.composition.inpaint import Contents, select_around_objects, select_half_plane, select_polygon
+from models.execution import SamplingExecution
 from models.labels import require_labels
 from models.pipeline import PrITTIPipeline
 from models.sampling.repaint import RePaintConfig
@@ -95,6 +96,7 @@ class InpaintRequest(Request):
         seed: Seed of the noise.
         repaint: RePaint options.
         guidance_scale: Scale of classifier-free guidance.
+        execution: How the model runs.
     """
 
     where: RegionConfig
@@ -104,6 +106,7 @@ class InpaintRequest(Request):
     seed: int
     repaint: RePaintConfig
     guidance_scale: float
+    execution: SamplingExecution = field(default_factory=SamplingExecution)
 
 
 def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
@@ -227,6 +230,7 @@ class Inpainter:
     def __init__(self, request: InpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
         self.request, self.chosen = request, chosen
         self.pipeline = load_pipeline(request.model)
+        self.pipeline.set_execution(request.execution)
 
     def __call__(self, row: dict) -> dict:
         request, shard = self.request, self.request.shard(row["id"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,6 +23,7 @@ from models.composition.outpaint import (
     rank_four_colors,
     rank_outward,
 )
+from models.execution import SamplingExecution
 from models.sampling.repaint import RePaintConfig
 from models.scene import UNSET, Scene
 from models.tensors import make_empty_scene
@@ -59,6 +60,7 @@ class OutpaintRequest(Request):
         num_blocks: Four numbers of blocks to generate: ahead, behind, to the left, to the right.
         order: Order in which blocks are generated (a key of RANKS).
         batch_size: Maximum number of blocks per batch.
+        execution: How the model runs.
     """
 
     label: str | None
@@ -70,6 +72,7 @@ class OutpaintRequest(Request):
     num_blocks: tuple[int, int, int, int] = (1, 1, 1, 1)
     order: str = "outward"
     batch_size: int = 4
+    execution: SamplingExecution = field(default_factory=SamplingExecution)
 
     def scene_id(self, number: int) -> str:
         """Return the id of an extended scene.
@@ -210,6 +213,7 @@ class Outpainter:
     def __init__(self, request: OutpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
         self.request, self.chosen = request, chosen
         self.pipeline = load_pipeline(request.model)
+        self.pipeline.set_execution(request.execution)
 
     @cached_property
     def block_grid(self) -> BlockGrid:

@@ -7,7 +7,8 @@ from helpers import ROOT, run_command, small_spec, tiny_pipeline
 
 import models.execution
 from models.execution import FixedShapeDenoiser, SamplingExecution, require_bf16
-from models.sampling.diffusion import SceneNoise, finish_drawing, make_keyed_generator, start_drawing
+from models.sampling.diffusion import InpaintCondition, SceneNoise, finish_drawing, make_keyed_generator, start_drawing
+from models.sampling.repaint import RePaintConfig
 from models.training import sample_noise
 
 LABELS = ["low", "medium", "high"]
@@ -104,6 +105,22 @@ def test_bf16_keeps_float32_where_it_matters():
     assert {d for name, d in types.items() if not name.startswith("blocks.")} == {torch.float32}
     assert rounded.dtype == torch.float32 and not torch.equal(rounded, exact)
     assert (rounded - exact).std() < 0.01 * exact.std()
+
+
+@pytest.mark.parametrize("guidance", [0.0, 1.0], ids=["repaint", "pseudoinverse"])
+def test_inpainting_runs_with_the_options_of_sampling(guidance):
+    """RePaint in bfloat16 changes by rounding, and the known half stays bit-identical."""
+    pipeline = make_pipeline()
+    repaint = RePaintConfig(10, 2, 2, guidance)
+    known = torch.randn(1, *pipeline.latent_shape, generator=torch.Generator().manual_seed(0))
+    mask = torch.zeros_like(known)
+    mask[..., : known.shape[-1] // 2] = 1
+    condition = InpaintCondition(known, mask)
+    exact = pipeline.inpaint_latents(condition, ["low"], 1, [0], repaint)
+    pipeline.set_execution(SamplingExecution(precision="bf16", cuda_graphs=True))
+    rounded = pipeline.inpaint_latents(condition, ["low"], 1, [0], repaint)
+    assert torch.equal(rounded[mask == 0], known[mask == 0]) and not torch.equal(rounded, exact)
+    assert (rounded - exact).std() < 0.02 * exact.std()
 
 
 COMPILE = """
