@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Train and evaluate the paper's models, and write the paper's tables next to its numbers.
+"""Train and evaluate the paper's models, and write its tables with both numbers.
 
     jobs/reproduce_paper.py kitti360 --input KITTI-360 --dry-run          the plan, with times and disk space
     jobs/reproduce_paper.py kitti360 --input KITTI-360 --num-workers 4 --inception FILE
@@ -7,8 +7,9 @@
     jobs/reproduce_paper.py kitti360 --input KITTI-360 --scale mini      a rehearsal on two cores: small networks
 
 The job preprocesses the drives, trains the layout VAE, encodes latents, trains the transformers, samples scenes and
-evaluates them. It writes tables.html, tables.md and tables.json. In each row, the paper's number stands next to the
-reproduced one, its ceiling (real scenes) and a control (damaged scenes). First it prints the plan: the command of each
+evaluates them. It writes tables.html, tables.md and tables.json. Each row holds the paper's number and the reproduced
+number. Where they exist, it also holds a ceiling (other real scenes, or layouts that are decoded without a network) and
+a control (damaged scenes). A remark names missing values. First it prints the plan: the command of each
 stage, its time and the disk space. Run the same command again to resume after an interruption.
 """
 
@@ -32,13 +33,14 @@ class Options:
     scale: Literal["paper", "mini"] = "paper"
     """Size of the networks and number of steps: as in the paper, or a rehearsal of minutes without a GPU."""
     output: str = ""
-    """Directory to write all files to: data, runs, models, MLflow, tables (default: $PRITTI_HOME/paper-<dataset>)."""
+    """Directory to write all files to: data, runs, models, tables, and MLflow's database if it is local (default:
+    $PRITTI_HOME/paper-<dataset>)."""
     dry_run: bool = False
     """Print the plan and stop."""
     transformers: tuple[Literal["b", "l", "xl"], ...] = ("b",)
     """Transformers to train: DiT-B, DiT-L, DiT-XL. With --scale mini, all have the same small network."""
     ablations: bool = False
-    """Also train the layout VAE without latent split, without objects and without ground, for Tab. 2."""
+    """Also train the three ablations of the layout VAE of Tab. 2: no latent split, no objects, no ground."""
     inception: str = ""
     """File of Inception weights for precision, recall, FID and Inception score (default: none)."""
     vgg16: str = ""
@@ -50,7 +52,7 @@ class Options:
     dit_steps: int | None = None
     """Number of training steps of each transformer (default: as in the preset)."""
     num_scenes: int | None = None
-    """Number of scenes to generate per transformer (default: one per training scene, as in the paper; mini: 96)."""
+    """Number of scenes to generate per transformer (default: one per training pose; mini: 96)."""
     num_inference_steps: int = 250
     """Number of denoising steps (paper: 250)."""
     skip_unreadable: bool = False

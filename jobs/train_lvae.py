@@ -4,6 +4,7 @@
     jobs/train_lvae.py                      the town preset on $PRITTI_HOME/datasets/town
     jobs/train_lvae.py smoke                seconds; generates its own data
     jobs/train_lvae.py kitti360 --dataset DIR --num-workers 4
+    jobs/train_lvae.py kitti360-mini --dataset DIR --start-from MODEL --name longer     continue with trained weights
     jobs/train_lvae.py demo --train-object-decoder-of town --name lvae-decoder     a new object decoder for a pipeline
 
 --train-object-decoder-of keeps the encoders and the ground decoder of a pipeline. The latents do not change, so the
@@ -42,6 +43,9 @@ class Config:
     train_object_decoder_of: str = ""
     """Train only a new object decoder, for this pipeline; all values that --model of other jobs accepts are valid
     (default: train all parts)."""
+    start_from: str = ""
+    """Initialise with the weights of this layout VAE: its directory, or a pipeline as --model of other jobs accepts it
+    (default: new weights)."""
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
     min_workers: int | None = None

@@ -709,7 +709,7 @@ class PrITTIPipeline:
         seed: int = 0,
         index: int = 0,
         overlap: float = 0.5,
-        mode: str = "reencode",
+        mode: str | None = None,
         num_blocks: tuple[int, int, int, int] = (1, 1, 1, 1),
         repaint: RePaintConfig | None = None,
         guidance_scale: float = 1.0,
@@ -728,14 +728,14 @@ class PrITTIPipeline:
             mode: "copy" copies the shifted latents of the neighbours. "reencode" transforms the decoded content of the
                 neighbours into the frame of the block and encodes it again. Object latents contain absolute centres,
                 which a copy does not change. "paper" is the outpainting of the paper: a copy, without blending of the
-                ground and without removal of duplicates.
+                ground and without removal of duplicates. None: the mode that the pipeline stores (`neighbour_latents`).
             num_blocks: Number of blocks to add ahead, behind, to the left and to the right. The paper adds one block on
                 every side.
             repaint: Options of RePaint; None: the options of the paper.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `generate`.
             side: "ahead", "behind", "left" or "right". If `side` is set, the scene is extended only on this side, by
-                (1 - overlap) of a block, and `num_blocks` is ignored.
+                (1 - overlap) of a block, and `num_blocks` and `mode` are ignored: the neighbours are encoded again.
 
         Returns:
             One scene that covers all blocks.
@@ -755,7 +755,7 @@ class PrITTIPipeline:
             seed,
             index,
             overlap,
-            mode,
+            mode or self.config.neighbour_latents,
             num_blocks,
             repaint,
             guidance_scale,

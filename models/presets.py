@@ -81,7 +81,7 @@ LVAE_PRESETS: dict[str, LVAEPreset] = {
     # The paper reports three days of training on one A100 but not the number of steps.
     "kitti360": LVAEPreset("kitti360",  256, PAPER, 32,    300_000, init_from_data=False),
     "av2":      LVAEPreset("av2",       256, PAPER, 32,    300_000, init_from_data=False),
-    # The mechanisms of `kitti360` with fewer layers and less width, for two cores.
+    # The networks of `kitti360` with fewer layers and less width, for two cores. It starts from the means of the data.
     "kitti360-mini": LVAEPreset("kitti360", 256, MINI, 8, 3_000, learning_rate=1e-3),
     # This preset combines the paper's object encoder with the town's ground branch and the cell decoder.
     # The latent has the same shape as in the paper, but training costs less.
@@ -149,7 +149,7 @@ class DiTPreset:
 
 
 SMALL_DIT = DiTConfig(2, 6, 256, 4, prediction="v_prediction")
-LITERAL: dict[str, Any] = {"neighbour_latents": "paper"}
+PAPER_OUTPAINTING: dict[str, Any] = {"neighbour_latents": "paper"}
 TOWN_TRAINING: dict[str, Any] = {"normalise_latents": True, "learning_rate": 1e-3, "ema_decay": 0.999}
 
 # fmt: off
@@ -158,13 +158,14 @@ DIT_PRESETS: dict[str, DiTPreset] = {
     "smoke":       DiTPreset("smoke",    DiTConfig(2, 1, 32, 2),     8,   8, True, 1e-3),
     "demo":        DiTPreset("demo",     SMALL_DIT,                  16,  30_000, **TOWN_TRAINING),
     "town":        DiTPreset("town",     SMALL_DIT,                  16,  30_000, **TOWN_TRAINING),
-    # The paper reports three days of training on four A100s but not the number of steps.
     "kitti360-mini": DiTPreset("kitti360-mini", DiTConfig(2, 4, 128, 4), 16, 3_000, learning_rate=1e-3,
-                               ema_decay=0.999, **LITERAL),
-    "kitti360":    DiTPreset("kitti360", DiTConfig(2, 12, 768, 12),  256, 400_000, **LITERAL),
-    "kitti360-l":  DiTPreset("kitti360", DiTConfig(2, 24, 1024, 16), 256, 400_000, **LITERAL),
-    "kitti360-xl": DiTPreset("kitti360", DiTConfig(2, 28, 1152, 16), 256, 400_000, **LITERAL),
-    "av2":         DiTPreset("av2",      DiTConfig(2, 12, 768, 12),  256, 400_000, **LITERAL),
+                               ema_decay=0.999, **PAPER_OUTPAINTING),
+    # The paper reports three days of training on four A100s but not the number of steps. It trains all sizes with the
+    # same total compute; here, all sizes have the same number of steps.
+    "kitti360":    DiTPreset("kitti360", DiTConfig(2, 12, 768, 12),  256, 400_000, **PAPER_OUTPAINTING),
+    "kitti360-l":  DiTPreset("kitti360", DiTConfig(2, 24, 1024, 16), 256, 400_000, **PAPER_OUTPAINTING),
+    "kitti360-xl": DiTPreset("kitti360", DiTConfig(2, 28, 1152, 16), 256, 400_000, **PAPER_OUTPAINTING),
+    "av2":         DiTPreset("av2",      DiTConfig(2, 12, 768, 12),  256, 400_000, **PAPER_OUTPAINTING),
 }
 # fmt: on
 

@@ -37,7 +37,7 @@ from models.vae.matching import NonFiniteCostError
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Options of AdamW. The learning rate is constant or follows a cosine (OneCycle without warm-up).
+    """Options of AdamW. The learning rate is constant or follows a cosine, after an optional linear warm-up.
 
     Attributes:
         steps: Number of training steps.

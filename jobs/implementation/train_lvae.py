@@ -16,7 +16,7 @@ from jobs.implementation.checks import find_training_dataset, needs_smoke_inputs
 from jobs.implementation.smoke_inputs import make_smoke_dataset
 from jobs.support import trainer
 from jobs.support.callbacks import ReconstructionCheck
-from jobs.support.cli import home_path, resolve_path
+from jobs.support.cli import home_path, make_absolute, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.model_files import publish_directory
 from jobs.support.outputs import hold_training
@@ -24,6 +24,7 @@ from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun, convert_to_tensors
 from jobs.train_lvae import Config
 from models.augment import Augmentation
+from models.base import CONFIG_NAME
 from models.batch import LayoutBatch
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
@@ -48,6 +49,7 @@ OF_OBJECT_DECODER = (
     "auxiliary_losses",
     "denoising_groups",
 )
+OF_LOSSES = ("loss_unit", "auxiliary_losses")  # Options that change no weights.
 START_SCENES, START_SHARDS = 96, 16  # numbers of training scenes and shards from which the model is initialised
 
 
@@ -65,7 +67,12 @@ def prepare(config: Config) -> TrainingRun:
     augment = Augmentation(config.flip, *((1.0, np.radians(2.5)) if config.jitter else (0.0, 0.0)), config.seed)
     identity = make_run_identity(config, row, settings, spec, root, augment)
     name = find_run_name(config)
-    kept = None
+    kept = start = None
+    if config.start_from and config.train_object_decoder_of:
+        raise ValueError("--start-from and --train-object-decoder-of exclude each other: give one of them")
+    if config.start_from:
+        start = load_start(config.start_from, row.architecture(), spec)
+        identity |= {"start_from": digest_weights(start)}
     if config.train_object_decoder_of:
         kept = load_kept_weights(config.train_object_decoder_of, row.architecture(), spec)
         identity |= {"start_from": kept.digest}
@@ -85,8 +92,9 @@ def prepare(config: Config) -> TrainingRun:
             row.kl_weight,
             row.latent_noise,
             execution,
-            sample if row.init_from_data else None,
+            sample if row.init_from_data and start is None else None,
             kept,
+            start and start.state_dict(),
         ),
         stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
         reader=LayoutReader(spec, augment if config.flip or config.jitter else None),
@@ -202,13 +210,44 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
     return Kept(digest_weights(lvae), digest_weights(pipeline.dit), lvae.state_dict())
 
 
+def load_start(model: str, architecture: dict, spec: LayoutSpec) -> LayoutVAE:
+    """Return the trained layout VAE from which a run starts.
+
+    Args:
+        model: Directory of a layout VAE, or any value that --model accepts.
+        architecture: Options of the preset.
+        spec: Layout of the dataset.
+
+    Raises:
+        ValueError: The networks or the layout differ from those of this run.
+    """
+    directory = make_absolute(model)
+    if storage.exists(storage.join_uri(directory, CONFIG_NAME)):
+        lvae = load_lvae(directory)
+    else:
+        lvae = load_pipeline(find_pipeline_directory(model)).lvae
+    for (key, built), (_, wanted) in zip(list_options(lvae.config), list_options(architecture), strict=True):
+        if built != wanted and key not in OF_LOSSES:
+            raise ValueError(
+                f"--start-from {model}: its {key} is {built}, but that of this preset is {wanted}; use the preset with"
+                " which it was trained"
+            )
+    lvae.spec.require(spec, f"the dataset of this run, which continues {model},")
+    return lvae
+
+
 def list_kept_options(options: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """List the options of a LayoutVAE by name, without the layout and the options of the object decoder."""
+    return [entry for entry in list_options(options) if entry[0] not in OF_OBJECT_DECODER]
+
+
+def list_options(options: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """List the options of a LayoutVAE by name, without the layout."""
     found: list[tuple[str, Any]] = []
     for name, option in options.items():
         value = asdict(option) if is_dataclass(option) and not isinstance(option, type) else option
         entries = list(value.items()) if isinstance(value, Mapping) else [(name, value)]
-        found += [entry for entry in entries if name != "layout" and entry[0] not in OF_OBJECT_DECODER]
+        found += [entry for entry in entries if name != "layout"]
     return found
 
 
@@ -268,6 +307,7 @@ def build(
     execution: ExecutionConfig,
     sample: dict | None,
     kept: Kept | None,
+    start: dict[str, Tensor] | None,
     device: torch.device,
     wrap: Wrap,
 ) -> Trainer:
@@ -276,6 +316,8 @@ def build(
     model = LayoutVAE(layout=layout, **architecture)
     if sample is not None:
         model.init_from_data(LayoutBatch.from_compact(convert_to_tensors(sample)))
+    if start:
+        model.load_state_dict(start)
     if kept:
         model.freeze_all_but_object_decoder(kept.state)
     return make_lvae_trainer(model, settings, kl_weight, device, wrap, execution, latent_noise)

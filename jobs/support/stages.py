@@ -27,7 +27,8 @@ class Stages:
 
         Args:
             name: Name of the stage.
-            work: Function that does the work. If the stage was completed before, the function returns immediately.
+            work: Function that does the work. It is always called, and must return immediately if its results exist.
+                The file keeps the longest duration of each stage.
 
         Returns:
             Result of the function.

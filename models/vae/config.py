@@ -89,7 +89,8 @@ class ObjectConfig:
         learned_content: If True, the contents of queries start from learned values instead of zeros.
         position_unit: Unit of the sine position embeddings: "map" or "cell" (`detr_decoder.embed_positions`).
         auxiliary_losses: If True, each layer of the decoder has a loss in training.
-        denoising_groups: Number of groups of denoising queries in training.
+        denoising_groups: Number of groups of denoising queries in training; 0: none. Each layer has a centre and a
+            Cholesky loss for them, without an existence loss.
     """
 
     width: int = 512

@@ -1,7 +1,8 @@
 """Object decoder of the paper: a DETR transformer predicts primitives from the latent (paper, supplement B.2).
 
-With the default options, the decoder is DETR (Carion et al., ECCV 2020) without auxiliary losses, as in the paper. The
-other options of `ObjectConfig` are changes of DETR from the literature, which make training faster:
+With the default options, the decoder is DETR (Carion et al., ECCV 2020) without dropout, as in the paper. Auxiliary
+losses and a normalisation after the last layer, which DETR also has, are not mentioned in the paper and are off. The
+other options of `ObjectConfig` are changes from the literature that were proposed to speed up training:
 
 * `queries="anchors"`: each query has a learned reference point, as in Anchor DETR (Wang et al., AAAI 2022). The
   position embedding of a query is a function of its point. A layer predicts offsets from the points, and the next layer
@@ -55,8 +56,8 @@ def embed_positions(
     position = row_col + 0.5
     if unit == "map":
         position = position / size * 2 * torch.pi
-    frequency = 10_000 ** (torch.arange(0, width // 2, 2, dtype=torch.float32, device=row_col.device) / (width // 2))
-    angle = position[..., None] / frequency  # (..., 2, d / 4)
+    wavelength = 10_000 ** (torch.arange(0, width // 2, 2, dtype=torch.float32, device=row_col.device) / (width // 2))
+    angle = position[..., None] / wavelength  # (..., 2, d / 4)
     return torch.stack([angle.sin(), angle.cos()], dim=-1).flatten(-3)
 
 
@@ -168,7 +169,7 @@ class DETRDecoder(nn.Module):
         self.latent_size, self.width, self.unit = latent_size, width, config.position_unit
         self.auxiliary_losses, self.groups = config.auxiliary_losses, config.denoising_groups
         self.project_in = nn.Linear(latent_channels, width)  # patch size 1
-        self.queries = self.anchors = self.content = self.noised = None
+        self.queries = self.anchors = self.content = self.embed_noised = None
         conditional = config.queries == "conditional"
         if config.queries == "learned":
             self.queries = nn.Parameter(torch.randn(count, width))
@@ -179,8 +180,8 @@ class DETRDecoder(nn.Module):
         if config.learned_content:
             self.content = nn.Parameter(torch.randn(count, width))
         if self.groups:
-            self.noised = nn.Linear(FEATURES, width)
-            self.noised_category = nn.Parameter(torch.randn(len(slots), width))
+            self.embed_noised = nn.Linear(FEATURES, width)
+            self.embed_noised_category = nn.Parameter(torch.randn(len(slots), width))
         layers = (DecoderLayer(width, heads, hidden, conditional) for _ in range(config.layers))
         self.layers = nn.ModuleList(layers)
         self.heads = nn.ModuleList(OutputHeads(width, config.head_hidden) for _ in slots)
@@ -218,13 +219,13 @@ class DETRDecoder(nn.Module):
         anchors = None if self.anchors is None else self.anchors.expand(len(latent), -1, -1)
         *others, last = self._run_layers(x, anchors, memory)
         denoised = []
-        if self.noised is not None and noised is not None and real is not None:
+        if self.embed_noised is not None and noised is not None and real is not None:
             groups = noised.shape[1]
             truth, visible = noised.flatten(0, 1), real.repeat_interleave(groups, 0)
             visible = visible | ~visible.any(dim=1, keepdim=True)  # Attention needs at least one visible token.
-            content = apply_in_float32(self.noised, truth)
+            content = apply_in_float32(self.embed_noised, truth)
             sizes = torch.tensor(self.proposals, device=latent.device)
-            content = content + self.noised_category.repeat_interleave(sizes, 0, output_size=shape[1])
+            content = content + self.embed_noised_category.repeat_interleave(sizes, 0, output_size=shape[1])
             anchors = None if self.anchors is None else truth[..., :CENTER].clamp(1e-4, 1 - 1e-4).logit()
             cells = memory.repeat_interleave(groups, 0)
             denoised = self._run_layers(content, anchors, cells, visible)
@@ -235,9 +236,9 @@ class DETRDecoder(nn.Module):
     ) -> list[Prediction]:
         """Return the predictions of the last layer, preceded by those of the other layers if they have losses."""
         wanted = self.training and (self.auxiliary_losses or visible is not None)
-        is_noised, found, sine = visible is not None, [], None
+        is_denoising, found, sine = visible is not None, [], None
         place: Tensor = x if self.queries is None else self.queries
-        if is_noised and self.queries is not None:
+        if is_denoising and self.queries is not None:
             x, place = torch.zeros_like(x), x
         positions = cast(Tensor, self.positions)
         for k, layer in enumerate(self.layers):

@@ -171,25 +171,27 @@ def compute_lvae_loss(
     unit = batch.features.new_tensor(output.feature_unit)
     truth = batch.features / unit
 
-    def score(found: Prediction, groups: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-        features = found.features / unit
+    def compute_losses(prediction: Prediction, groups: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+        features = prediction.features / unit
         if groups:  # Slot k of a denoising query belongs to slot k of the truth.
-            aim, real = truth.repeat_interleave(groups, 0), batch.real.repeat_interleave(groups, 0)
+            target, real = truth.repeat_interleave(groups, 0), batch.real.repeat_interleave(groups, 0)
             slot = torch.arange(real.shape[1], device=real.device).expand_as(real)
             assignment = torch.where(real, slot, -1)
         else:
-            aim, real = truth, batch.real
+            target, real = truth, batch.real
             assignment = match_primitives(
-                features, found.existence_logit, aim, real, spec.slots, output.proposals, output.match_weights
+                features, prediction.existence_logit, target, real, spec.slots, output.proposals, output.match_weights
             )
-        return compute_object_losses(features, found.existence_logit, aim, real, assignment, spec, output.proposals)
+        return compute_object_losses(
+            features, prediction.existence_logit, target, real, assignment, spec, output.proposals
+        )
 
-    existence, center, cholesky = score(Prediction(output.features, output.existence_logit))
+    existence, center, cholesky = compute_losses(Prediction(output.features, output.existence_logit))
     auxiliary = existence.new_zeros(())
     for found in output.auxiliary:
-        auxiliary = auxiliary + sum(score(found))
+        auxiliary = auxiliary + sum(compute_losses(found))
     for found in output.denoised:
-        _, *distances = score(found, len(found.features) // len(batch))
+        _, *distances = compute_losses(found, len(found.features) // len(batch))
         auxiliary = auxiliary + sum(distances)
     return LVAELoss(
         occupancy=ground * OCCUPANCY_WEIGHT * compute_occupancy_loss(output.occupancy_logit, batch.occupied),

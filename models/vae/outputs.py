@@ -18,7 +18,7 @@ from models.vae.matching import MatchWeights
 class Posterior:
     """Diagonal Gaussian over the joint layout latent.
 
-    The first half of the channels belongs to the ground, the second half to the objects.
+    If the model has both branches, the first half of the channels belongs to the ground, the second to the objects.
 
     Attributes:
         mean: Mean.

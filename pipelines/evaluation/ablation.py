@@ -283,10 +283,10 @@ DECODERS = {
     "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
     "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
 }
-# Changes of the paper's DETR decoder, each alone. The models have only the object branch: with the latent split, the
-# branches share no weights and no losses.
+# Changes of the DETR decoder or of its training, each alone. The models have only the object branch: with the latent
+# split, the branches share no weights and no losses.
 DETR_CHANGES = {
-    "the paper's DETR": Variant(),
+    "baseline": Variant(),
     "loss in metres": Variant({"objects": {"loss_unit": "metres"}}),
     "loss in cells": Variant({"objects": {"loss_unit": "cells"}}),
     "learning rate 3e-4": Variant(options={"learning_rate": 3e-4}),

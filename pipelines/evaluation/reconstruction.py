@@ -460,11 +460,12 @@ def compute_reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, 
 def score_limits(
     scenes: SceneSubset, spec: LayoutSpec, voxel_range_m: tuple[float, float] = VOXEL_RANGE_M
 ) -> dict[str, dict]:
-    """Score reconstructions without a network: the best that a layout can represent, and damaged scenes.
+    """Score the ceiling and the control of the reconstruction, without a network.
 
-    The ceiling encodes each scene to a layout and back. It loses objects without a slot, values outside the bounds and
-    detail below the resolution. The control does the same with a damaged copy of the scene: each object moves by up to
-    4 m, and the ground is shifted by 4 m (pipelines.metrics.controls).
+    The ceiling encodes each scene to a layout and back. It loses objects without a slot, the part of centres and
+    Cholesky parameters outside the bounds, and detail below the resolution. Heights are not clipped. The control does
+    the same with a damaged copy of the scene: each object moves by up to 4 m, and the ground is shifted by 4 m
+    (pipelines.metrics.controls).
 
     Args:
         scenes: Scenes to score.

@@ -1,7 +1,7 @@
 """Tables of the paper with the scores of a reproduction next to the paper's numbers.
 
 Each row has the place of the number in the paper, its value there, the reproduced value, and the value of the ceiling
-and of a control from the same run. Differences between both protocols stand in the same row.
+and of a control from the same run, if they exist. The remark names differences of protocol and missing values.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ class PaperNumber:
         value: Number in the paper; None: the paper has no such number.
         score: Path of the score in metrics.json of the reproduction, separated by dots.
         factor: Factor from the reproduced score to the unit of the paper.
-        higher_is_better: Whether a larger value is better; None: neither.
         needs: Option that the score needs: "inception" or "".
         transformer: Transformer of a generation score, "b", "l" or "xl"; "": a score of the layout VAE.
     """
@@ -37,7 +36,6 @@ class PaperNumber:
     value: float | None
     score: str
     factor: float = 1.0
-    higher_is_better: bool | None = True
     needs: str = ""
     transformer: str = ""
 
@@ -53,9 +51,9 @@ VOXELS, LVAE, GENERATION, AV2 = (
 # Scores that the paper does not report: FID of the scenes of precision and recall, which has a ceiling, and scores that
 # need no weights.
 FURTHER = (
-    ("FID of the scenes of precision and recall", "fid_small", False),
-    ("AUC of a classifier, 0.5 is perfect", "two_sample_auc", False),
-    ("Frechet distance of relations", "relation_frechet", False),
+    ("FID of the scenes of precision and recall", "fid_small"),
+    ("AUC of a classifier, 0.5 is perfect", "two_sample_auc"),
+    ("Fréchet distance of relations", "relation_frechet"),
 )
 
 
@@ -63,22 +61,22 @@ def _list_generation() -> Iterator[PaperNumber]:
     rows = {"b": (0.712, 0.491, 73.952, 3.856), "l": (0.807, 0.545, 71.028, 4.210), "xl": (0.812, 0.616, 71.735, 3.964)}
     for source, table, found in (("kitti360", GENERATION, rows), ("av2", AV2, {"b": (0.572, 0.410, 144.330, 2.878)})):
         for size, (precision, recall, fid, inception_score) in found.items():
-            for name, value, score, is_higher in (
-                ("precision", precision, "precision_k3", True),
-                ("recall", recall, "recall_k3", True),
-                ("FID", fid, "fid", False),
-                ("Inception score", inception_score, "inception_score", None),
+            for name, value, score in (
+                ("precision", precision, "precision_k3"),
+                ("recall", recall, "recall_k3"),
+                ("FID", fid, "fid"),
+                ("Inception score", inception_score, "inception_score"),
             ):
                 label = f"{name}, DiT-{size.upper()}"
-                yield PaperNumber(table, label, source, value, score, 1.0, is_higher, "inception", size)
-            for name, score, is_higher in FURTHER:
+                yield PaperNumber(table, label, source, value, score, needs="inception", transformer=size)
+            for name, score in FURTHER:
                 needs = "inception" if "fid" in score else ""
                 label = f"{name}, DiT-{size.upper()}"
-                yield PaperNumber(table, label, source, None, score, 1.0, is_higher, needs, size)
+                yield PaperNumber(table, label, source, None, score, needs=needs, transformer=size)
             if source == "kitti360":
                 seconds = {"b": 0.58, "l": 1.78, "xl": 2.11}[size]
                 label = f"time per scene (s), DiT-{size.upper()}"
-                yield PaperNumber(table, label, source, seconds, "seconds", 1.0, False, "", size)
+                yield PaperNumber(table, label, source, seconds, "seconds", transformer=size)
 
 
 def _list_ablation() -> Iterator[PaperNumber]:
@@ -97,19 +95,19 @@ def _list_ablation() -> Iterator[PaperNumber]:
         for (name, score), value in zip(scores, values, strict=True):
             if value is not None:
                 path = f"ablation.{variant}.{score}_mean"
-                yield PaperNumber(LVAE, f"{name}, {variant}", "kitti360", value, path, 100.0, "MSE" not in name)
+                yield PaperNumber(LVAE, f"{name}, {variant}", "kitti360", value, path, 100.0)
 
 
 PAPER_NUMBERS: tuple[PaperNumber, ...] = (
     PaperNumber(VOXELS, "IoU (%)", "kitti360", 90.58, "voxels.iou", 100.0),
     PaperNumber(VOXELS, "mIoU (%)", "kitti360", 70.27, "voxels.miou", 100.0),
-    PaperNumber(VOXELS, "rasters of a scene (MB)", "kitti360", 2.50, f"{MEMORY}.rasters", 1 / MIB, None),
-    PaperNumber(VOXELS, "primitives of a scene (MB)", "kitti360", 0.02, f"{MEMORY}.vectors", 1 / MIB, None),
-    PaperNumber(LVAE, "height MSE (0.01)", "kitti360", 0.75, "height_mse_normalised", 100.0, False),
+    PaperNumber(VOXELS, "rasters of a scene (MB)", "kitti360", 2.50, f"{MEMORY}.rasters", 1 / MIB),
+    PaperNumber(VOXELS, "primitives of a scene (MB)", "kitti360", 0.02, f"{MEMORY}.vectors", 1 / MIB),
+    PaperNumber(LVAE, "height MSE (0.01)", "kitti360", 0.75, "height_mse_normalised", 100.0),
     PaperNumber(LVAE, "ground IoU (%)", "kitti360", 99.96, "ground_iou", 100.0),
     PaperNumber(LVAE, "AP3D (%)", "kitti360", 62.12, "ap3d", 100.0),
     PaperNumber(LVAE, "AP3D@50 (%)", "kitti360", 46.96, "ap3d_50", 100.0),
-    PaperNumber(AV2, "height MSE (0.01)", "av2", 0.015, "height_mse_normalised", 100.0, False),
+    PaperNumber(AV2, "height MSE (0.01)", "av2", 0.015, "height_mse_normalised", 100.0),
     PaperNumber(AV2, "ground IoU (%)", "av2", 99.98, "ground_iou", 100.0),
     PaperNumber(AV2, "AP3D (%)", "av2", 56.495, "ap3d", 100.0),
     PaperNumber(AV2, "AP3D@50 (%)", "av2", 39.490, "ap3d_50", 100.0),
@@ -144,7 +142,8 @@ class Reproduced:
 
     Attributes:
         reconstruction: Scores of the layout VAE (`evaluate_reconstruction`), of its ceiling and of its control, by the
-            names "ours", "ceiling" and "control". The scores of an ablation are under "ablation" and its name.
+            names "ours", "ceiling" and "control". Scores of ablations are in the entry "ours" under "ablation" and the
+            name of the variant.
         generation: Scores of each transformer by its size. They contain the scores of both protocols.
         notes: Remarks by path of the score, for example the number of scenes.
     """
@@ -155,15 +154,15 @@ class Reproduced:
 
 
 def compare_with_paper(source: str, found: Reproduced) -> list[dict]:
-    """Return one row per number of the paper.
+    """Return one row per number of the paper, and rows of scores that the paper does not report.
 
     Args:
         source: Dataset, "kitti360" or "av2".
         found: Scores of the reproduction.
 
     Returns:
-        Rows with the keys table, name, paper, ours, ceiling, control, note. A number that was not computed is None, and
-        the note says why.
+        Rows with the keys table, name, paper, ours, ceiling, control, note. A number that does not exist is None. The
+        note says why the reproduced number is missing.
     """
     rows = []
     for number in PAPER_NUMBERS:

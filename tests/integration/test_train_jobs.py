@@ -10,9 +10,11 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 import pytest
-from helpers import run_command
+import torch
+from helpers import run_command, small_spec
 from safetensors.torch import load_file
 
+from models.presets import LVAE_PRESETS
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import find_shards
 
@@ -203,6 +205,26 @@ def test_train_lvae_retrains_object_decoder_for_kept_latents(home):
                 train_object_decoder_of=str(kept),
             )
         )
+
+
+def test_train_lvae_starts_from_trained_weights(home):
+    from jobs.implementation.train_lvae import load_start, prepare
+    from jobs.train_lvae import Config
+
+    trained = load_weights(home / "models/pritti-smoke/lvae")
+    for number, model in enumerate((home / "models/pritti-smoke", home / "models/pritti-smoke/lvae")):
+        run = prepare(Config(preset="smoke", name=f"more-{number}", start_from=str(model)))
+        built = run.build(torch.device("cpu"), lambda model: model).model.state_dict()
+        assert all(torch.equal(built[name], value) for name, value in trained.items())
+        assert run.identity["start_from"]
+    dataset = str(home / "datasets/smoke")
+    with pytest.raises(ValueError, match=r"--start-from .*its latent_channels is 4, but that of this preset is 16"):
+        prepare(Config(preset="demo", name="other", dataset=dataset, start_from=str(model)))
+    with pytest.raises(ValueError, match="exclude each other"):
+        prepare(Config(preset="smoke", name="both", start_from=str(model), train_object_decoder_of=str(model)))
+    spec = small_spec()
+    with pytest.raises(ValueError, match=r"which continues .* has another LayoutSpec: slots is"):
+        load_start(str(model), LVAE_PRESETS["smoke"].architecture(), spec)
 
 
 def test_encode_rejects_lvae_of_another_dataset(home, tmp_path):

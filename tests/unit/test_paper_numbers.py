@@ -31,9 +31,10 @@ def list_names() -> dict[str, Any]:
     names: dict[str, Any] = {"lvae": LVAE_PRESETS["kitti360"], "dit": DIT_PRESETS["kitti360"]}
     names |= {"dit_l": DIT_PRESETS["kitti360-l"], "dit_xl": DIT_PRESETS["kitti360-xl"]}
     names |= {function.__name__: function for function in (make_lvae, count_parameters, len, tuple)}
-    for module in set(re.findall(r"\b((?:models|pipelines)(?:\.[a-z_]+)+)\.[A-Z]", str(ROWS))):
+    for module in set(re.findall(r"\b((?:jobs|models|pipelines)(?:\.[a-z_]+)+)\.[A-Z]", str(ROWS))):
         importlib.import_module(module)
-    return names | {"OutpaintConfig": OutpaintConfig} | {n: importlib.import_module(n) for n in ("models", "pipelines")}
+    packages = {name: importlib.import_module(name) for name in ("jobs", "models", "pipelines")}
+    return names | {"OutpaintConfig": OutpaintConfig} | packages
 
 
 def test_page_lists_the_paper():
