@@ -30,8 +30,9 @@ EVALUATE_S = 0.64
 # Reported by the paper (supplement B.2 and B.3, Tab. 3): GPU hours on A100, and seconds per scene on one A100.
 PAPER_LVAE_GPU_H, PAPER_DIT_GPU_H, PAPER_SAMPLE_S = 72.0, 288.0, {"b": 0.58, "l": 1.78, "xl": 2.11}
 ENCODE_GPU_S = 0.01  # Assumed.
-# Measured on two cores without a GPU: seconds per step, and per scene with 250 denoising steps.
+# Guesses for two cores, not measured: seconds per step, and per scene with 250 denoising steps.
 MINI_LVAE_STEP_S, MINI_DIT_STEP_S, MINI_SAMPLE_S, MINI_ENCODE_S, MINI_RECONSTRUCT_S = 2.0, 0.15, 2.0, 0.1, 0.5
+MEASURED, GUESSED = "rates of benchmarks/cost_rates.py, two cores", "a guess for two cores, not measured"
 BYTES_PER_WEIGHT, KEPT_CHECKPOINTS = 20, 2  # Weights, EMA, two moments of AdamW and the model, in float32.
 WEIGHTS = {"lvae": 93.1e6, "b": 130e6, "l": 458e6, "xl": 675e6}
 MINI_WEIGHTS = 4e6
@@ -91,7 +92,7 @@ def count_poses(config: Options) -> Counts:
     """Count the poses of the raw dataset, from the files of poses only.
 
     Raises:
-        ValueError: A split has no poses, or the training split has fewer than the protocol needs.
+        ValueError: A split has no poses, or the protocol needs more training poses or generated scenes.
     """
     counts = dict.fromkeys((TRAIN, TEST), 0.0)
     for task in plan_shards(make_drives_config(config)):
@@ -109,6 +110,11 @@ def count_poses(config: Options) -> Counts:
         raise ValueError(
             f"{make_absolute(config.input)} has {found.train} training poses, but the paper's protocol compares"
             f" {PAPER_SCENES:,}; use --scale mini, or a larger part of the dataset"
+        )
+    if config.scale == "paper" and config.num_scenes and config.num_scenes < found.train:
+        raise ValueError(
+            f"--num-scenes is {config.num_scenes}, but the paper's protocol compares as many generated scenes as"
+            f" training scenes; use at least {found.train}, or --scale mini"
         )
     return found
 
@@ -144,14 +150,13 @@ def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
     data, total = home_path("datasets", source), counts.train + counts.test
     names = ("gpus", "wait_for_resources_s", "if_busy")
     shared: dict[str, Any] = {name: getattr(config, name) for name in names}
-    cores = "measured on two cores"
     yield Stage(
         "preprocess the drives",
         "preprocess_scenes",
         make_drives_config(config),
         total * PREPROCESS_S / 2 / 3600,
         total * SCENE_BYTES / 1e9,
-        cores,
+        MEASURED,
     )
     preset = find_presets(config, "b")[0]
     lvae = home_path("models", f"lvae-{preset}")
@@ -164,7 +169,7 @@ def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
         LVAEConfig(preset, data, num_workers=workers, steps=config.lvae_steps, seed=config.seed, **shared),
         steps * MINI_LVAE_STEP_S / 3600 if mini else share * PAPER_LVAE_GPU_H / workers,
         weights * BYTES_PER_WEIGHT * KEPT_CHECKPOINTS / 1e9,
-        cores if mini else f"the paper's {PAPER_LVAE_GPU_H:g} hours on one A100",
+        GUESSED if mini else f"the paper's {PAPER_LVAE_GPU_H:g} hours on one A100",
     )
     yield Stage(
         "encode latents",
@@ -172,7 +177,7 @@ def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
         EncodeConfig(dataset=data, lvae=lvae, num_actors=workers, **shared),
         total * (MINI_ENCODE_S if mini else ENCODE_GPU_S) / workers / 3600,
         total * LATENT_BYTES / 1e9,
-        cores if mini else "assumed",
+        GUESSED if mini else "assumed",
     )
     yield Stage(
         "evaluate the reconstruction",
@@ -186,7 +191,7 @@ def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
         ),
         counts.test * MINI_RECONSTRUCT_S / 3600,
         counts.test * 1e4 / 1e9,
-        cores,
+        GUESSED,
     )
     if config.ablations:
         variants = ("without latent split", "without objects", "without ground")
@@ -196,14 +201,14 @@ def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
             Branches(preset, data, steps=steps, num_seeds=1, only_variants=variants, num_workers=workers, **shared),
             3 * (steps * MINI_LVAE_STEP_S / 3600 if mini else share * PAPER_LVAE_GPU_H / workers),
             3 * weights * BYTES_PER_WEIGHT * KEPT_CHECKPOINTS / 1e9,
-            cores if mini else f"the paper's {PAPER_LVAE_GPU_H:g} hours on one A100 per variant",
+            GUESSED if mini else f"the paper's {PAPER_LVAE_GPU_H:g} hours on one A100 per variant",
         )
     for size in config.transformers:
         yield from _list_transformer_stages(config, counts, size, data, shared)
 
 
 def _list_transformer_stages(config: Options, counts: Counts, size: str, data: str, shared: dict) -> Iterator[Stage]:
-    mini, workers, cores = config.scale == "mini", config.num_workers, "measured on two cores"
+    mini, workers = config.scale == "mini", config.num_workers
     preset, scenes, title = find_presets(config, size)[1], count_scenes(config, counts), f"DiT-{size.upper()}"
     full = DIT_PRESETS[preset].steps
     steps = config.dit_steps or full
@@ -224,7 +229,7 @@ def _list_transformer_stages(config: Options, counts: Counts, size: str, data: s
         ),
         steps * MINI_DIT_STEP_S / 3600 if mini else steps / full * PAPER_DIT_GPU_H / workers,
         weights * BYTES_PER_WEIGHT * KEPT_CHECKPOINTS / 1e9,
-        cores if mini else f"the paper's {PAPER_DIT_GPU_H:g} hours on A100",
+        GUESSED if mini else f"the paper's {PAPER_DIT_GPU_H:g} hours on A100",
     )
     per_scene = MINI_SAMPLE_S if mini else PAPER_SAMPLE_S[size]
     yield Stage(
@@ -242,7 +247,7 @@ def _list_transformer_stages(config: Options, counts: Counts, size: str, data: s
         ),
         scenes * per_scene * config.num_inference_steps / 250 / workers / 3600,
         scenes * GENERATED_BYTES / 1e9,
-        cores if mini else f"the paper's {per_scene:g} s per scene on one A100",
+        GUESSED if mini else f"the paper's {per_scene:g} s per scene on one A100",
     )
     common: dict[str, Any] = {"real": data, "generated": home_path("generated"), "run": size}
     common |= {"inception": config.inception, "num_actors": workers, **shared}
@@ -260,7 +265,7 @@ def _list_transformer_stages(config: Options, counts: Counts, size: str, data: s
         ),
         10 * hours if mini or counts.test >= PAPER_SCENES else hours,
         10 * 2 * min(scenes, PAPER_SCENES) * FEATURE_BYTES / 1e9,
-        cores,
+        MEASURED,
     )
     if not mini:
         yield Stage(
@@ -269,7 +274,7 @@ def _list_transformer_stages(config: Options, counts: Counts, size: str, data: s
             EvaluateConfig(protocol="paper-fid", output=home_path("evaluations", f"{size}-fid"), **common),
             2 * EVALUATE_S * scenes / 2 / 3600,
             2 * scenes * FEATURE_BYTES / 1e9,
-            cores,
+            MEASURED,
         )
 
 

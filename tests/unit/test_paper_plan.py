@@ -1,6 +1,7 @@
 """Tests of the plan of jobs/reproduce_paper.py and of the paper's tables."""
 
 import shlex
+import subprocess
 from dataclasses import replace
 from importlib import import_module
 
@@ -66,6 +67,13 @@ def test_poses_of_town_drive_are_counted_before_preprocessing(tmp_path):
     assert counts.train > counts.test > 0 and counts.train + counts.test <= lines
     with pytest.raises(ValueError, match="training poses, but the paper's protocol compares 1,000; use --scale mini"):
         count_poses(replace(config, scale="paper"))
+
+
+def test_too_few_generated_scenes_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("jobs.implementation.paper_plan.PAPER_SCENES", 10)
+    write_kitti360(generate_town(3), tmp_path)
+    with pytest.raises(ValueError, match=r"--num-scenes is 20, but .*as many generated scenes as training scenes"):
+        count_poses(Kitti360(str(tmp_path), num_scenes=20))
 
 
 def test_missing_parts_of_datasets_are_found_first(tmp_path):
@@ -136,6 +144,8 @@ def test_scores_are_found_by_path():
     assert find_score(scores, "voxels.miou") is None and find_score(scores, "label") is None
 
 
-def test_make_targets_need_a_directory():
-    text = (ROOT / "Makefile").read_text()
-    assert "paper-kitti360 paper-av2: .venv/ready" in text and "ROOT=DIR" in text
+@pytest.mark.parametrize("name", ["kitti360", "av2"])
+def test_make_target_runs_the_job_with_its_arguments(name):
+    words = ["make", "-n", f"paper-{name}", "ROOT=/data", "ARGS=--dry-run"]
+    printed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert f'jobs/reproduce_paper.py {name} --input "/data" --output "runs/paper-{name}" --dry-run' in printed
