@@ -46,13 +46,10 @@ from safetensors.numpy import load_file, save_file
 from models.batch import LayoutBatch
 from models.dit import DiT
 from models.execution import SamplingExecution, require_bf16
-from models.geometry.cholesky import decode_cholesky_boxes
-from models.geometry.iou3d import compute_iou3d_pairs, make_boxes
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTConfig, DiTPreset, LVAEPreset
-from models.tensors import EXISTENCE_THRESHOLD
 from models.training import (
     ExecutionConfig,
     OptimizerConfig,
@@ -62,7 +59,7 @@ from models.training import (
     make_lvae_trainer,
 )
 from models.vae import losses
-from models.vae.matching import MatchWeights, match_primitives
+from models.vae.accuracy import compute_accuracy, pair_primitives
 
 ROOT = Path(__file__).parents[1]
 SECTION_SECONDS = 480.0
@@ -492,44 +489,22 @@ def run_precision(setup: Setup) -> Iterator[Row]:
 
 @torch.no_grad()
 def measure_primitives(model: LayoutVAE, arrays: dict[str, torch.Tensor]) -> dict[str, float]:
-    """Match the proposals that the model decodes from the latent mean with the true primitives, and compare both.
-
-    The matching is one to one within a category, by centre and Cholesky distance.
+    """Return the accuracy of the primitives that the model decodes from the latent mean.
 
     Args:
         model: Layout VAE in evaluation mode.
         arrays: Compact layouts.
 
     Returns:
-        Median distance of matched centres (m). Share of the true primitives whose match exists (probability above
-        EXISTENCE_THRESHOLD) and lies within 1 m. Share of the existing proposals that have such a match. Mean IoU3D of
-        all matches.
+        The scores of `models.vae.accuracy.Accuracy`, shares in percent.
     """
-    spec, batch = model.spec, LayoutBatch.from_compact(arrays)
-    output = model.decode(model.encode(batch).mean).float()
-    found = match_primitives(
-        output.features,
-        output.existence_logit,
-        batch.features,
-        batch.real,
-        spec.slots,
-        output.proposals,
-        MatchWeights(existence=0.0),
-    )
-    sample, proposal = (found >= 0).nonzero(as_tuple=True)
-    boxes = []
-    for features in (output.features[sample, proposal], batch.features[sample, found[sample, proposal]]):
-        values = features.double().cpu().numpy()
-        center_m = spec.center_bounds_m.restore(values[:, :3])
-        boxes.append(make_boxes(center_m, *decode_cholesky_boxes(spec.cholesky_bounds.restore(values[:, 3:]))))
-    distance_m = np.linalg.norm(boxes[0].center_m - boxes[1].center_m, axis=1)
-    likely = output.existence_logit.sigmoid() > EXISTENCE_THRESHOLD
-    right = (distance_m < 1) & likely[sample, proposal].cpu().numpy()
+    batch = LayoutBatch.from_compact(arrays)
+    accuracy = compute_accuracy(pair_primitives(model.decode(model.encode(batch).mean), batch, model.spec))
     return {
-        "median centre error (m)": float(np.median(distance_m)),
-        "primitives found within 1 m (%)": 100 * float(right.sum() / max(len(right), 1)),
-        "proposals within 1 m of a primitive (%)": 100 * float(right.sum() / max(int(likely.sum()), 1)),
-        "IoU3D of matched primitives (%)": 100 * float(compute_iou3d_pairs(*boxes).mean()),
+        "median centre error (m)": accuracy.median_center_error_m,
+        "primitives found within 1 m (%)": 100 * accuracy.found_1m,
+        "proposals within 1 m of a primitive (%)": 100 * accuracy.right_1m,
+        "IoU3D of matched primitives (%)": 100 * accuracy.mean_iou3d,
     }
 
 

@@ -237,7 +237,10 @@ def train_variant(config: Branches, variant: str, seed: int, output: str) -> dic
     described |= {"parameters": trained.num_parameters(), "training_seconds": seconds}
     described |= {"gflops": count_gflops(trained, make_layout_batch(example, trained.spec))}
     described |= {"curve": training.tracker.history("validation_ap3d"), "scenes": reconstruction["scenes"]}
-    return described | ablation.average_measurements(select_variants(config)[variant], reconstruction)
+    scores = dict(reconstruction)
+    if trained.config["branches"] != "ground":
+        scores |= ablation.measure_accuracy(trained, selection)
+    return described | ablation.select_measures(select_variants(config)[variant], scores)
 
 
 def count_gflops(model: LayoutVAE, batch: LayoutBatch) -> float:

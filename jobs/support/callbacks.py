@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache, reduce
 from operator import add
 from typing import cast
@@ -16,6 +16,7 @@ from models.sampling.diffusion import Diffusion, SamplingSchedule, SceneNoise, m
 from models.scene import Scene
 from models.tensors import decode_layout, make_layout_batch
 from models.training import Trainer, sample_noise
+from models.vae.accuracy import compute_accuracy, join_pairs, pair_primitives
 from models.vae.losses import compute_lvae_loss
 from pipelines.metrics.reconstruction import (
     compute_detection_scores,
@@ -63,7 +64,7 @@ class ReconstructionCheck:
             cast(LayoutVAE, trainer.ema_model().eval()),
             list(load_held_out_scenes(self.root, self.source, self.count)),
         )
-        spec, sums, losses, rebuilt, matches = model.spec, [], [], [], []
+        spec, sums, losses, rebuilt, matches, pairs = model.spec, [], [], [], [], []
         for start in range(0, len(scenes), self.batch):
             chosen = scenes[start : start + self.batch]
             batch = make_layout_batch(chosen, spec).to(trainer.device)
@@ -73,7 +74,10 @@ class ReconstructionCheck:
             output, posterior = model(batch, noise)
             parts = compute_lvae_loss(output, posterior, batch, spec, self.kl_weight).items()
             losses.append({name: float(value) * len(chosen) for name, value in parts.items()})
-            layouts = model.decode(posterior.mean).layouts()
+            decoded = model.decode(posterior.mean)
+            if decoded.branches != "ground":
+                pairs.append(pair_primitives(decoded, batch, spec))
+            layouts = decoded.layouts()
             for scene, layout, *truth in zip(chosen, layouts, batch.occupied, batch.height, strict=True):
                 rebuilt.append(decode_layout(layout, spec, scene))
                 matches.append(match_scene(scene, decode_layout(layout, spec, scene, threshold=-1.0)))
@@ -87,6 +91,8 @@ class ReconstructionCheck:
         metrics = {f"validation_{name}": sum(part[name] for part in losses) / len(scenes) for name in losses[0]}
         metrics |= {"validation_ground_iou": scores.iou, "validation_height_rmse_m": scores.height_rmse_m}
         metrics |= {"validation_ap3d": compute_detection_scores(join_matches(matches)).ap3d}
+        if pairs and len((joined := join_pairs(pairs)).distance_m):
+            metrics |= {f"validation_{name}": value for name, value in asdict(compute_accuracy(joined)).items()}
         pictures = [render_bev(s) for s in (*scenes[:SHOWN], *rebuilt[:SHOWN])]
         return metrics, {"reconstruction": arrange_contact_sheet(pictures, columns=min(SHOWN, len(scenes)))}
 

@@ -19,6 +19,7 @@ import torch
 
 from models.geometry.encodings import ENCODINGS
 from models.geometry.iou3d import compute_iou3d_pairs, make_boxes
+from models.lvae import LayoutVAE
 from models.studies.orientation_study import (
     BOX_DISTRIBUTIONS,
     CenteredBoxes,
@@ -26,11 +27,14 @@ from models.studies.orientation_study import (
     draw_boxes,
     train_autoencoder,
 )
+from models.tensors import make_layout_batch
+from models.vae.accuracy import compute_accuracy, join_pairs, pair_primitives
 from pipelines.reporting.chart import Chart, draw_chart_svg
 from pipelines.reporting.drawings_page import CaptionedSvg, DrawingsSection, render_page_html
 from pipelines.reporting.report import Table, Text
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_tasks
+from pipelines.schema.scene_subset import SceneSubset
 
 TEST_COUNT = 2000
 TRAIN_KEY, TEST_KEY, NOISE_KEY = 0, 1, 2
@@ -331,13 +335,29 @@ AUGMENTATIONS = {
     "mirrored and moved": Variant(options={"flip": True, "jitter": True}),
 }
 MEASURES = {"ground_iou": "ground", "height_mse_normalised": "ground", "height_rmse_m": "ground"}
-MEASURES |= {"ap3d": "objects", "ap3d_50": "objects"}
+MEASURES |= {"ap3d": "objects", "ap3d_50": "objects", "found_1m": "objects", "median_center_error_m": "objects"}
 
 
-def average_measurements(variant: Variant, reconstruction: Mapping) -> dict[str, float | None]:
-    """Return the scores of `evaluate_reconstruction` for a variant; the scores of a missing branch are None."""
+def select_measures(variant: Variant, scores: Mapping[str, float]) -> dict[str, float | None]:
+    """Return the scores of a variant that tables show; the scores of a missing branch are None.
+
+    Args:
+        variant: Variant.
+        scores: Scores of `evaluate_reconstruction` and of `measure_accuracy`.
+    """
     kept = variant.architecture.get("branches", "both")
-    return {name: reconstruction[name] if kept in ("both", side) else None for name, side in MEASURES.items()}
+    return {name: scores[name] if kept in ("both", side) else None for name, side in MEASURES.items()}
+
+
+@torch.no_grad()
+def measure_accuracy(model: LayoutVAE, selection: SceneSubset, batch_size: int = 8) -> dict[str, float]:
+    """Return the accuracy of the primitives that a model decodes from the latent means of selected scenes."""
+    pairs = []
+    for shard, rows in selection.shards():
+        for start in range(0, len(rows), batch_size):
+            batch = make_layout_batch(shard.scenes(rows[start : start + batch_size]), model.spec)
+            pairs.append(pair_primitives(model.decode(model.encode(batch).mean), batch, model.spec))
+    return asdict(compute_accuracy(join_pairs(pairs)))
 
 
 def group_by_variant(scores: Iterable[dict]) -> list[dict]:
@@ -351,7 +371,7 @@ def group_by_variant(scores: Iterable[dict]) -> list[dict]:
         out |= {name: found[0][name] for name in ("parameters", "gflops")}
         out["training_seconds"] = float(np.mean([row["training_seconds"] for row in found]))
         for name in MEASURES:
-            values = [row[name] for row in found if row[name] is not None]
+            values = [row[name] for row in found if row.get(name) is not None]  # Old studies lack some measures.
             for way, f in (("mean", np.mean), ("min", np.min), ("max", np.max)):
                 out[f"{name}_{way}"] = float(f(values)) if values else None
         rows.append(out)
@@ -417,7 +437,10 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
         "height_rmse_m": "height RMSE, cm",
         "ap3d": "AP3D, %",
         "ap3d_50": "AP3D@50, %",
+        "found_1m": "found within 1 m, %",
+        "median_center_error_m": "median centre error, cm",
     }
+    names = {name: text for name, text in names.items() if any(row[f"{name}_mean"] is not None for row in rows)}
     columns = ["variant", "parameters", "GFLOP", "seeds", "steps", "minutes", *names.values()]
     cells = []
     for row in rows:
@@ -431,7 +454,8 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
         cells.append(cell)
     note = (
         "Scores are given as mean (minimum to maximum) over seeds. Scenes are reconstructed from the latent mean. "
-        "GFLOP is the cost to encode and decode one scene."
+        "GFLOP is the cost to encode and decode one scene. Found: the matched proposal exists and lies within 1 m. The "
+        "centre error is the distance between a primitive and its matched proposal, whether this exists or not."
     )
     return Table("Variants of the layout VAE", columns, cells, note=note)
 

@@ -16,7 +16,7 @@ from pipelines.evaluation.ablation import (
     BRANCHES,
     DECODERS,
     DETR_CHANGES,
-    average_measurements,
+    select_measures,
 )
 
 
@@ -102,9 +102,9 @@ def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys)
         scores = {"ground_iou": 0.9 + 0.01 * seed, "height_mse_normalised": 1e-4, "height_rmse_m": 0.1}
         described = {"variant": variant, "seed": seed, "steps": config.steps, "dataset": "DIR", "parameters": 1}
         described |= {"gflops": 0.5}
-        reconstruction = scores | {"ap3d": 0.5, "ap3d_50": 0.25}
+        scores |= {"ap3d": 0.5, "ap3d_50": 0.25, "found_1m": 0.6, "median_center_error_m": 0.4}
         described |= {"training_seconds": 1.0, "curve": [(2, 0.1), (7, 0.5)]}
-        return described | average_measurements(BRANCHES[variant], reconstruction)
+        return described | select_measures(BRANCHES[variant], scores)
 
     monkeypatch.setattr(job, "train_variant", train_variant)
     output = job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=2))
@@ -119,7 +119,8 @@ def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys)
     assert (full["seeds"], full["steps"]) == (3, 7) and abs(full["ground_iou_mean"] - 0.91) < 1e-9
     assert (full["ground_iou_min"], full["ground_iou_max"]) == (0.9, 0.92) and bare["ap3d_mean"] == 0.5
     assert bare["ground_iou_mean"] is None and rows["without objects"]["ap3d_mean"] is None
-    assert "without latent split" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "without latent split" in printed and "median centre error, cm" in printed and "40.00 (40.00" in printed
     with pytest.raises(ValueError, match="holds a study with steps=7, asked for 8"):
         job.compare_variants(job.Branches(preset="smoke", steps=8, num_seeds=2))
     with pytest.raises(ValueError, match=r"--only-variants \['without sky'\]: expected some of \['full model'"):
