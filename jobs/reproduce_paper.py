@@ -44,7 +44,7 @@ class Options:
     inception: str = ""
     """File of Inception weights for precision, recall, FID and Inception score (default: none)."""
     vgg16: str = ""
-    """File of VGG16 weights for the analysis of memorisation (default: none)."""
+    """File of VGG16 weights for the distances to the nearest training scene, supplement G (default: none)."""
     num_workers: int = 1
     """Number of training workers and of models that run in parallel; use one per GPU."""
     lvae_steps: int | None = None

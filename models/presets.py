@@ -161,10 +161,10 @@ DIT_PRESETS: dict[str, DiTPreset] = {
     "kitti360-mini": DiTPreset("kitti360-mini", DiTConfig(2, 4, 128, 4), 16, 3_000, learning_rate=1e-3,
                                ema_decay=0.999, **PAPER_OUTPAINTING),
     # The paper reports three days of training on four A100s but not the number of steps. It trains all sizes with the
-    # same total compute; here, all sizes have the same number of steps.
+    # same total compute, here the same number of floating-point operations as the 400,000 steps of DiT-B.
     "kitti360":    DiTPreset("kitti360", DiTConfig(2, 12, 768, 12),  256, 400_000, **PAPER_OUTPAINTING),
-    "kitti360-l":  DiTPreset("kitti360", DiTConfig(2, 24, 1024, 16), 256, 400_000, **PAPER_OUTPAINTING),
-    "kitti360-xl": DiTPreset("kitti360", DiTConfig(2, 28, 1152, 16), 256, 400_000, **PAPER_OUTPAINTING),
+    "kitti360-l":  DiTPreset("kitti360", DiTConfig(2, 24, 1024, 16), 256, 114_300, **PAPER_OUTPAINTING),
+    "kitti360-xl": DiTPreset("kitti360", DiTConfig(2, 28, 1152, 16), 256, 77_800, **PAPER_OUTPAINTING),
     "av2":         DiTPreset("av2",      DiTConfig(2, 12, 768, 12),  256, 400_000, **PAPER_OUTPAINTING),
 }
 # fmt: on

@@ -41,8 +41,27 @@ def needs_smoke_inputs(config: LVAEConfig | DiTConfig) -> bool:
 def check_train_lvae(config: LVAEConfig) -> None:
     row = find_preset(LVAE_PRESETS, config.preset)
     require_positive(config, "gradient_accumulation_steps")
+    if config.start_from and config.train_object_decoder_of:
+        raise ValueError("--start-from and --train-object-decoder-of exclude each other: give one of them")
+    if config.start_from:
+        find_start(config.start_from)
     if not needs_smoke_inputs(config):
         Dataset.open(find_training_dataset(config, row.source))
+
+
+def find_start(model: str) -> tuple[str, bool]:
+    """Return the directory of --start-from of train_lvae, and whether it holds a layout VAE and not a pipeline.
+
+    Raises:
+        ValueError: The directory holds neither.
+    """
+    directory = make_absolute(model)
+    if storage.exists(storage.join_uri(directory, "config.json")):
+        return directory, True
+    try:
+        return find_pipeline_directory(model), False
+    except ValueError as error:
+        raise ValueError(f"--start-from {error}; it also holds no layout VAE") from None
 
 
 def check_train_dit(config: DiTConfig) -> None:

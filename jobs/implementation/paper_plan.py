@@ -23,6 +23,7 @@ from pipelines.schema.splits import TEST, TRAIN
 
 MINI_SCENES = 96
 PAPER_SCENES = 1000  # Scenes for precision and recall.
+NEAREST_SCENES = 50_000  # Generated and training scenes of supplement G.
 SWEEPS_PER_LOG = 156.5  # Argoverse 2: 313 sweeps in two logs.
 # Measured by benchmarks/cost_rates.py: CPU time (s) and stored bytes per scene.
 PREPROCESS_S, SCENE_BYTES, LATENT_BYTES, GENERATED_BYTES, FEATURE_BYTES = 0.0054, 14e3, 146e3, 21e3, 80e3
@@ -258,7 +259,7 @@ def _list_transformer_stages(config: Options, counts: Counts, size: str, data: s
         "evaluate_scenes",
         EvaluateConfig(
             controls=mini or counts.test >= PAPER_SCENES,
-            vgg16=config.vgg16,
+            vgg16=config.vgg16 if mini else "",
             output=home_path("evaluations", f"{size}-precision"),
             **limits,
             **common,
@@ -274,6 +275,22 @@ def _list_transformer_stages(config: Options, counts: Counts, size: str, data: s
             EvaluateConfig(protocol="paper-fid", output=home_path("evaluations", f"{size}-fid"), **common),
             2 * EVALUATE_S * scenes / 2 / 3600,
             2 * scenes * FEATURE_BYTES / 1e9,
+            MEASURED,
+        )
+    if config.vgg16 and not mini:
+        count = min(scenes, NEAREST_SCENES)
+        yield Stage(
+            f"find the nearest training scenes of {title}",
+            "evaluate_scenes",
+            EvaluateConfig(
+                max_scenes=count,
+                reference="uniform",
+                vgg16=config.vgg16,
+                output=home_path("evaluations", f"{size}-nearest"),
+                **common,
+            ),
+            2 * EVALUATE_S * count / 2 / 3600,
+            2 * count * FEATURE_BYTES / 1e9,
             MEASURED,
         )
 

@@ -18,6 +18,7 @@ from jobs.implementation.ablate_lvae import compare_variants
 from jobs.implementation.encode_latents import encode
 from jobs.implementation.evaluate_scenes import evaluate
 from jobs.implementation.paper_plan import (
+    NEAREST_SCENES,
     PAPER_SCENES,
     Options,
     Stage,
@@ -213,8 +214,24 @@ def collect_scores(config: Options) -> Reproduced:
             notes |= dict.fromkeys(("precision_k3", "recall_k3", "fid", "inception_score"), count)
         if "sets" not in scores:
             notes |= dict.fromkeys(("precision_k3", "recall_k3", "fid_small"), "too few test scenes for a ceiling")
+        nearest = f"{size}-precision" if config.scale == "mini" else f"{size}-nearest"
+        if storage.exists(home_path("evaluations", nearest, "metrics.json")):
+            compared = read_generation(nearest)
+            scores |= {name: value for name, value in compared.items() if name == "memorisation"}
+            notes |= describe_memorisation(compared)
         generation[size] = scores
     return Reproduced({"ours": ours} | storage.read_json(path), generation, notes)
+
+
+def describe_memorisation(scores: Mapping[str, Any]) -> dict[str, str]:
+    """Return the remarks of the rows of supplement G, in which the paper compares 50,000 scenes on each side."""
+    generated, real = (scores["scenes"][side] for side in ("generated", "real"))
+    note = (
+        f"{generated:,} generated and {real:,} training scenes, paper: {NEAREST_SCENES:,} each; the distances between"
+        " training scenes are the reference; features of fc7, the paper names no layer"
+    )
+    sides, values = ("generated", "real"), ("mean", "median", "minimum", "maximum")
+    return {f"memorisation.{side}.{value}": note for side in sides for value in values}
 
 
 def read_generation(name: str) -> dict:

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from jobs.implementation.checks import find_training_dataset, needs_smoke_inputs
+from jobs.implementation.checks import find_start, find_training_dataset, needs_smoke_inputs
 from jobs.implementation.smoke_inputs import make_smoke_dataset
 from jobs.support import trainer
 from jobs.support.callbacks import ReconstructionCheck
-from jobs.support.cli import home_path, make_absolute, resolve_path
+from jobs.support.cli import home_path, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.model_files import publish_directory
 from jobs.support.outputs import hold_training
@@ -24,7 +24,6 @@ from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun, convert_to_tensors
 from jobs.train_lvae import Config
 from models.augment import Augmentation
-from models.base import CONFIG_NAME
 from models.batch import LayoutBatch
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
@@ -68,8 +67,6 @@ def prepare(config: Config) -> TrainingRun:
     identity = make_run_identity(config, row, settings, spec, root, augment)
     name = find_run_name(config)
     kept = start = None
-    if config.start_from and config.train_object_decoder_of:
-        raise ValueError("--start-from and --train-object-decoder-of exclude each other: give one of them")
     if config.start_from:
         start = load_start(config.start_from, row.architecture(), spec)
         identity |= {"start_from": digest_weights(start)}
@@ -221,11 +218,8 @@ def load_start(model: str, architecture: dict, spec: LayoutSpec) -> LayoutVAE:
     Raises:
         ValueError: The networks or the layout differ from those of this run.
     """
-    directory = make_absolute(model)
-    if storage.exists(storage.join_uri(directory, CONFIG_NAME)):
-        lvae = load_lvae(directory)
-    else:
-        lvae = load_pipeline(find_pipeline_directory(model)).lvae
+    directory, is_lvae = find_start(model)
+    lvae = load_lvae(directory) if is_lvae else load_pipeline(directory).lvae
     for (key, built), (_, wanted) in zip(list_options(lvae.config), list_options(architecture), strict=True):
         if built != wanted and key not in OF_LOSSES:
             raise ValueError(

@@ -26,7 +26,7 @@ class PaperNumber:
         value: Number in the paper; None: the paper has no such number.
         score: Path of the score in metrics.json of the reproduction, separated by dots.
         factor: Factor from the reproduced score to the unit of the paper.
-        needs: Option that the score needs: "inception" or "".
+        needs: Option that the score needs: "inception", "vgg16" or "".
         transformer: Transformer of a generation score, "b", "l" or "xl"; "": a score of the layout VAE.
     """
 
@@ -40,11 +40,12 @@ class PaperNumber:
     transformer: str = ""
 
 
-VOXELS, LVAE, GENERATION, AV2 = (
+VOXELS, LVAE, GENERATION, AV2, MEMORISATION = (
     "Tab. 1, voxel reconstruction",
     "Tab. 2, layout VAE",
     "Tab. 3, generation",
     "supplement, Argoverse 2",
+    "supplement G, distance to the nearest training scene",
 )
 
 
@@ -77,6 +78,15 @@ def _list_generation() -> Iterator[PaperNumber]:
                 seconds = {"b": 0.58, "l": 1.78, "xl": 2.11}[size]
                 label = f"time per scene (s), DiT-{size.upper()}"
                 yield PaperNumber(table, label, source, seconds, "seconds", transformer=size)
+
+
+def _list_memorisation() -> Iterator[PaperNumber]:
+    """List the distances of VGG16 features. The distances between training scenes are the reference."""
+    for side, values in {"generated": (52.2, 51.7, 27.2, 115.7), "real": (22.5, 22.0, 4.9, 58.7)}.items():
+        for score, value in zip(("mean", "median", "minimum", "maximum"), values, strict=True):
+            path = f"memorisation.{side}.{score}"
+            label = f"{'generated' if side == 'generated' else 'training'} scenes, {score}"
+            yield PaperNumber(MEMORISATION, label, "kitti360", value, path, needs="vgg16", transformer="b")
 
 
 def _list_ablation() -> Iterator[PaperNumber]:
@@ -113,6 +123,7 @@ PAPER_NUMBERS: tuple[PaperNumber, ...] = (
     PaperNumber(AV2, "AP3D@50 (%)", "av2", 39.490, "ap3d_50", 100.0),
     *_list_ablation(),
     *_list_generation(),
+    *_list_memorisation(),
 )
 
 
@@ -173,19 +184,30 @@ def compare_with_paper(source: str, found: Reproduced) -> list[dict]:
             sides = [scores, scores.get("sets", {}).get("ceiling", {}), scores.get("sets", {}).get("moved", {})]
         else:
             sides = [found.reconstruction.get(name, {}) for name in ("ours", "ceiling", "control")]
+        paths = (number.score, *[find_score_of_limits(number.score)] * 2)
         ours, ceiling, control = (
-            None if (value := find_score(side, number.score)) is None else value * number.factor for side in sides
+            None if (value := find_score(side, path)) is None else value * number.factor
+            for side, path in zip(sides, paths, strict=True)
         )
         note = found.notes.get(number.score, "")
-        if number.score.startswith(MEMORY):  # A size has no ceiling.
+        if number.score.startswith(MEMORY):
             ceiling = control = None
+            note = note or "a size has no ceiling"
         if number.transformer and number.transformer not in found.generation:
             note = f"not trained; add --transformers {number.transformer}"
         elif ours is None:
-            note = "needs --inception FILE" if number.needs == "inception" else note or _explain_missing(number)
+            note = f"needs --{number.needs} FILE" if number.needs else note or _explain_missing(number)
         row = {"table": number.table, "name": number.name, "paper": number.value, "ours": ours}
         rows.append(row | {"ceiling": ceiling, "control": control, "note": note})
     return rows
+
+
+def find_score_of_limits(path: str) -> str:
+    """Return the path of the score of ceiling and control that belongs to a score.
+
+    Ablations are evaluated on the same scenes as the full layout VAE and have the same ceiling and control.
+    """
+    return path.rpartition(".")[2].removesuffix("_mean") if path.startswith("ablation.") else path
 
 
 def _explain_missing(number: PaperNumber) -> str:

@@ -208,6 +208,7 @@ def test_train_lvae_retrains_object_decoder_for_kept_latents(home):
 
 
 def test_train_lvae_starts_from_trained_weights(home):
+    from jobs.implementation.checks import check_train_lvae
     from jobs.implementation.train_lvae import load_start, prepare
     from jobs.train_lvae import Config
 
@@ -218,10 +219,12 @@ def test_train_lvae_starts_from_trained_weights(home):
         assert all(torch.equal(built[name], value) for name, value in trained.items())
         assert run.identity["start_from"]
     dataset = str(home / "datasets/smoke")
+    with pytest.raises(ValueError, match=r"--start-from /nowhere: no PrITTI pipeline here, .* no layout VAE"):
+        check_train_lvae(Config(preset="smoke", start_from="/nowhere"))
     with pytest.raises(ValueError, match=r"--start-from .*its latent_channels is 4, but that of this preset is 16"):
         prepare(Config(preset="demo", name="other", dataset=dataset, start_from=str(model)))
     with pytest.raises(ValueError, match="exclude each other"):
-        prepare(Config(preset="smoke", name="both", start_from=str(model), train_object_decoder_of=str(model)))
+        check_train_lvae(Config(preset="smoke", name="both", start_from=str(model), train_object_decoder_of=str(model)))
     spec = small_spec()
     with pytest.raises(ValueError, match=r"which continues .* has another LayoutSpec: slots is"):
         load_start(str(model), LVAE_PRESETS["smoke"].architecture(), spec)

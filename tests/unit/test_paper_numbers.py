@@ -3,15 +3,19 @@
 import ast
 import importlib.util
 import re
+from dataclasses import asdict
 from typing import Any
 
 import pytest
+import torch
 from helpers import ROOT
 
 from jobs.outpaint_scenes import Config as OutpaintConfig
+from models.dit import DiT
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.presets import DIT_PRESETS, LVAE_PRESETS
+from models.training import count_flops
 
 ROW = re.compile(r"^\| ([^|]+) \| ([^|]+) \| `([^`]+)` \| ([^|]+) \|$", re.M)
 PAGE = (ROOT / "docs/reference/paper.md").read_text()
@@ -50,6 +54,21 @@ def test_field_has_the_number_of_the_paper(quantity, value, field, place):
 def test_av2_has_the_networks_of_the_paper():
     assert LVAE_PRESETS["av2"].model == LVAE_PRESETS["kitti360"].model
     assert DIT_PRESETS["av2"].model == DIT_PRESETS["kitti360"].model
+
+
+def count_training_flops(name: str) -> float:
+    """Return the operations of all steps, from models with one and with two blocks."""
+    preset, latents, number = DIT_PRESETS[name], torch.zeros(1, 64, 32, 32), torch.zeros(1, dtype=torch.long)
+    models = [DiT(**asdict(preset.model) | {"depth": depth}) for depth in (1, 2)]
+    with torch.no_grad():
+        first, second = (count_flops(lambda model=model: model(latents, number, number)) for model in models)
+    return preset.steps * (first + (preset.model.depth - 1) * (second - first))
+
+
+def test_all_transformers_have_the_same_total_compute():
+    base = count_training_flops("kitti360")
+    for name in ("kitti360-l", "kitti360-xl"):
+        assert count_training_flops(name) == pytest.approx(base, rel=1e-3)
 
 
 def test_page_links_each_mechanism_to_a_line_of_code():

@@ -28,7 +28,7 @@ FULL = Counts(61_913, 1_233)
 PLANS = [
     Kitti360("/data", transformers=("b", "l", "xl"), inception="w.pth", num_workers=4),
     Kitti360("/data", scale="mini", lvae_steps=10, dit_steps=20, num_scenes=8, num_inference_steps=5, seed=3),
-    Kitti360("/data", ablations=True, dit_steps=7),
+    Kitti360("/data", ablations=True, vgg16="v.pth", dit_steps=7),
     Av2("/data", gpus=0.0, wait_for_resources_s=60.0, skip_unreadable=True),
 ]
 
@@ -53,6 +53,8 @@ def test_plan_of_the_paper_has_its_presets_and_numbers():
     assert stages["evaluate the scenes of DiT-B"].config.protocol == "paper-pr"
     assert stages["compute FID of DiT-XL over all scenes"].config.protocol == "paper-fid"
     assert stages["preprocess the drives"].config.slots == "paper"
+    nearest = make_plan(PLANS[2], FULL)[-1]
+    assert nearest.name == "find the nearest training scenes of DiT-B" and nearest.config.max_scenes == 50_000
     for config in PLANS:
         for size in config.transformers:
             lvae, dit = find_presets(config, size)
@@ -113,7 +115,9 @@ def test_tables_show_each_number_of_the_paper():
         name: {"ap3d": ap, "ap3d_50": ap, "ground_iou": ap, "height_mse_normalised": 0.01, "voxels": {"iou": ap}}
         for name, ap in (("ours", 0.5), ("ceiling", 0.9), ("control", 0.1))
     }
+    reconstruction["ours"]["ablation"] = {"without objects": {"ground_iou_mean": 0.8}}
     generation = {"b": make_scores(0.25) | {"sets": {"ceiling": make_scores(0.75), "moved": make_scores(0.05)}}}
+    generation["b"]["memorisation"] = {"generated": {"mean": {"value": 50.0}, "median": 49.0}}
     rows = compare_with_paper("kitti360", Reproduced(reconstruction, generation, {"fid": "96 scenes"}))
     numbers = [n for n in PAPER_NUMBERS if n.source == "kitti360" and (n.value is not None or n.transformer == "b")]
     assert len(rows) == len(numbers) > 30
@@ -126,8 +130,15 @@ def test_tables_show_each_number_of_the_paper():
     assert found["FID, DiT-B"]["note"] == "96 scenes" and found["FID, DiT-B"]["ceiling"] == 0.75
     assert found["FID, DiT-L"]["ours"] is None and found["FID, DiT-L"]["note"] == "not trained; add --transformers l"
     assert found["mIoU (%)"]["note"] == "not computed"
+    ablation = found["ground IoU (%), without objects"]
+    assert (ablation["ours"], ablation["ceiling"], ablation["control"]) == (80.0, 90.0, 10.0)
+    assert found["AP3D (%), without ground"]["note"] == "needs --ablations"
+    assert (found["generated scenes, mean"]["paper"], found["generated scenes, mean"]["ours"]) == (52.2, 50.0)
+    assert found["generated scenes, median"]["ours"] == 49.0
+    assert found["training scenes, mean"]["note"] == "needs --vgg16 FILE"
+    assert found["rasters of a scene (MB)"]["note"] == "a size has no ceiling"
     text = format_paper_tables(rows)
-    assert "| AP3D (%) | 62.12 | 50 | 90 | 10 |  |" in text and text.count("\n## ") == 2
+    assert "| AP3D (%) | 62.12 | 50 | 90 | 10 |  |" in text and text.count("\n## ") == 3
     assert sum(len(table.rows) for table in build_paper_tables(rows)) == len(rows)
 
 
