@@ -21,7 +21,7 @@ from jobs.train_lvae import Config as LVAEConfig
 from models.presets import DIT_PRESETS, LVAE_PRESETS
 from pipelines.schema.splits import TEST, TRAIN
 
-MINI_SCENES = 96
+MINI_SCENES, MINI_LVAE_STEPS, MINI_DIT_STEPS = 96, 500, 1000
 PAPER_SCENES = 1000  # Scenes for precision and recall.
 NEAREST_SCENES = 50_000  # Generated and training scenes of supplement G.
 SWEEPS_PER_LOG = 156.5  # Argoverse 2: 313 sweeps in two logs.
@@ -161,13 +161,14 @@ def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
     )
     preset = find_presets(config, "b")[0]
     lvae = home_path("models", f"lvae-{preset}")
-    steps = config.lvae_steps or LVAE_PRESETS[preset].steps
+    chosen = config.lvae_steps or (MINI_LVAE_STEPS if mini else None)  # None: as in the preset
+    steps = chosen or LVAE_PRESETS[preset].steps
     share = steps / LVAE_PRESETS[preset].steps
     weights = MINI_WEIGHTS if mini else WEIGHTS["lvae"]
     yield Stage(
         "train the layout VAE",
         "train_lvae",
-        LVAEConfig(preset, data, num_workers=workers, steps=config.lvae_steps, seed=config.seed, **shared),
+        LVAEConfig(preset, data, num_workers=workers, steps=chosen, seed=config.seed, **shared),
         steps * MINI_LVAE_STEP_S / 3600 if mini else share * PAPER_LVAE_GPU_H / workers,
         weights * BYTES_PER_WEIGHT * KEPT_CHECKPOINTS / 1e9,
         GUESSED if mini else f"the paper's {PAPER_LVAE_GPU_H:g} hours on one A100",
@@ -212,7 +213,8 @@ def _list_transformer_stages(config: Options, counts: Counts, size: str, data: s
     mini, workers = config.scale == "mini", config.num_workers
     preset, scenes, title = find_presets(config, size)[1], count_scenes(config, counts), f"DiT-{size.upper()}"
     full = DIT_PRESETS[preset].steps
-    steps = config.dit_steps or full
+    chosen = config.dit_steps or (MINI_DIT_STEPS if mini else None)
+    steps = chosen or full
     weights = MINI_WEIGHTS if mini else WEIGHTS[size]
     model = home_path("models", f"pritti-{size}")
     yield Stage(
@@ -224,7 +226,7 @@ def _list_transformer_stages(config: Options, counts: Counts, size: str, data: s
             name=f"dit-{size}",
             output=model,
             num_workers=workers,
-            steps=config.dit_steps,
+            steps=chosen,
             seed=config.seed,
             **shared,
         ),
