@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from models.geometry.encodings import ENCODINGS
 from models.geometry.iou3d import compute_iou3d_pairs, make_boxes
@@ -28,7 +29,7 @@ from models.studies.orientation_study import (
     train_autoencoder,
 )
 from models.tensors import make_layout_batch
-from models.vae.accuracy import compute_accuracy, join_pairs, pair_primitives
+from models.vae.accuracy import Accuracy, compute_accuracy, join_pairs, pair_primitives
 from pipelines.reporting.chart import Chart, draw_chart_svg
 from pipelines.reporting.drawings_page import CaptionedSvg, DrawingsSection, render_page_html
 from pipelines.reporting.report import Table, Text
@@ -287,8 +288,8 @@ DECODERS = {
     "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
     "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
 }
-# Changes of the DETR decoder or of its training, each alone. The models have only the object branch: with the latent
-# split, the branches share no weights and no losses.
+# Changes of the DETR decoder or of its training: each alone, and four of them combined. The models have only the object
+# branch: with the latent split, the branches share no weights and no losses.
 DETR_CHANGES = {
     "baseline": Variant(),
     "loss in metres": Variant({"objects": {"loss_unit": "metres"}}),
@@ -304,6 +305,16 @@ DETR_CHANGES = {
     "conditional attention": Variant({"objects": {"queries": "conditional"}}),
     "denoising queries": Variant({"objects": {"denoising_groups": 1}}),
     "random start": Variant(options={"init_from_data": False}),
+    "combined": Variant(
+        {
+            "objects": {
+                "loss_unit": "metres",
+                "position_unit": "cell",
+                "queries": "conditional",
+                "auxiliary_losses": True,
+            }
+        }
+    ),
 }
 DETR_CHANGES = {
     name: Variant({"branches": "objects"} | dict(change.architecture), change.options)
@@ -335,7 +346,8 @@ AUGMENTATIONS = {
     "mirrored and moved": Variant(options={"flip": True, "jitter": True}),
 }
 MEASURES = {"ground_iou": "ground", "height_mse_normalised": "ground", "height_rmse_m": "ground"}
-MEASURES |= {"ap3d": "objects", "ap3d_50": "objects", "found_1m": "objects", "median_center_error_m": "objects"}
+OF_PRIMITIVES = ("ap3d", "ap3d_50", "found_1m", "median_center_error_m", "control_center_error_m")
+MEASURES |= dict.fromkeys(OF_PRIMITIVES, "objects")
 
 
 def select_measures(variant: Variant, scores: Mapping[str, float]) -> dict[str, float | None]:
@@ -351,13 +363,27 @@ def select_measures(variant: Variant, scores: Mapping[str, float]) -> dict[str, 
 
 @torch.no_grad()
 def measure_accuracy(model: LayoutVAE, selection: SceneSubset, batch_size: int = 8) -> dict[str, float]:
-    """Return the accuracy of the primitives that a model decodes from the latent means of selected scenes."""
-    pairs = []
-    for shard, rows in selection.shards():
-        for start in range(0, len(rows), batch_size):
-            batch = make_layout_batch(shard.scenes(rows[start : start + batch_size]), model.spec)
-            pairs.append(pair_primitives(model.decode(model.encode(batch).mean), batch, model.spec))
-    return asdict(compute_accuracy(join_pairs(pairs)))
+    """Return the accuracy of the primitives that a model decodes from the latent means of selected scenes.
+
+    Args:
+        model: Layout VAE with the object branch.
+        selection: Scenes; at least two.
+        batch_size: Number of scenes per forward pass.
+
+    Returns:
+        The scores of `Accuracy` by name, and `control_center_error_m`: the median centre error if each scene is
+        decoded from the latent of another selected scene. A decoder that ignores the latent has equal errors.
+    """
+    scenes = [scene for shard, rows in selection.shards() for scene in shard.scenes(rows)]
+    batches = [make_layout_batch(scenes[k : k + batch_size], model.spec) for k in range(0, len(scenes), batch_size)]
+    latents = torch.cat([model.encode(batch).mean for batch in batches])
+
+    def score(latents: Tensor) -> Accuracy:
+        parts = zip(batches, latents.split(batch_size), strict=True)
+        return compute_accuracy(join_pairs([pair_primitives(model.decode(z), batch, model.spec) for batch, z in parts]))
+
+    control = score(latents.roll(len(scenes) // 2, dims=0))
+    return asdict(score(latents)) | {"control_center_error_m": control.median_center_error_m}
 
 
 def group_by_variant(scores: Iterable[dict]) -> list[dict]:
@@ -438,7 +464,8 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
         "ap3d": "AP3D, %",
         "ap3d_50": "AP3D@50, %",
         "found_1m": "found within 1 m, %",
-        "median_center_error_m": "median centre error, cm",
+        "median_center_error_m": "centre error, cm",
+        "control_center_error_m": "centre error with another latent, cm",
     }
     names = {name: text for name, text in names.items() if any(row[f"{name}_mean"] is not None for row in rows)}
     columns = ["variant", "parameters", "GFLOP", "seeds", "steps", "minutes", *names.values()]
@@ -455,7 +482,9 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
     note = (
         "Scores are given as mean (minimum to maximum) over seeds. Scenes are reconstructed from the latent mean. "
         "GFLOP is the cost to encode and decode one scene. Found: the matched proposal exists and lies within 1 m. The "
-        "centre error is the distance between a primitive and its matched proposal, whether this exists or not."
+        "centre error is the median distance between a primitive and its matched proposal, whether this exists or not. "
+        "The control decodes each scene from the latent of another scene. A decoder that ignores the latent has the "
+        "same error there."
     )
     return Table("Variants of the layout VAE", columns, cells, note=note)
 
