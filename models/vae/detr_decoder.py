@@ -99,7 +99,10 @@ class ConditionalAttention(nn.Module):
 
 
 class DecoderLayer(nn.Module):
-    """DETR decoder layer with post-norm. Positions are added to queries and keys but not to values."""
+    """DETR decoder layer with post-norm. Positions are added to queries and keys but not to values.
+
+    The initial weights have the distribution of DETR's.
+    """
 
     def __init__(self, width: int, heads: int, hidden: int, conditional: bool = False) -> None:
         super().__init__()
@@ -107,6 +110,8 @@ class DecoderLayer(nn.Module):
         self.cross_attention = ConditionalAttention(width, heads) if conditional else Attention(width, heads)
         self.mlp = make_feed_forward(width, hidden)
         self.norm1, self.norm2, self.norm3 = nn.LayerNorm(width), nn.LayerNorm(width), nn.LayerNorm(width)
+        for linear in (self.self_attention.out, self.cross_attention.out, self.mlp[0], self.mlp[2]):
+            nn.init.xavier_uniform_(cast(nn.Linear, linear).weight)
 
     def forward(
         self,

@@ -6,16 +6,22 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+PACKED_GAIN = 0.5**0.5  # `nn.MultiheadAttention` initialises the three projections as one matrix (3 d, d).
+
 
 class Attention(nn.Module):
-    """Multi-head attention with separate projections, computed by the fused kernel of torch."""
+    """Multi-head attention with separate projections, computed by the fused kernel of torch.
+
+    The initial weights have the distribution of those of `nn.MultiheadAttention`.
+    """
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
         self.query, self.key, self.value, self.out = (nn.Linear(width, width) for _ in range(4))
         for projection in (self.query, self.key, self.value):
-            nn.init.xavier_uniform_(projection.weight)
+            nn.init.xavier_uniform_(projection.weight, PACKED_GAIN)
+        for projection in (self.query, self.key, self.value, self.out):
             nn.init.zeros_(projection.bias)
 
     def split(self, x: Float[Tensor, "batch n d"]) -> Float[Tensor, "batch heads n dh"]:

@@ -288,6 +288,14 @@ DECODERS = {
     "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
     "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
 }
+COMBINED = {
+    "objects": {
+        "loss_unit": "metres",
+        "position_unit": "cell",
+        "queries": "conditional",
+        "auxiliary_losses": True,
+    }
+}
 # Changes of the DETR decoder or of its training: each alone, and four of them combined. The models have only the object
 # branch: with the latent split, the branches share no weights and no losses.
 DETR_CHANGES = {
@@ -305,16 +313,8 @@ DETR_CHANGES = {
     "conditional attention": Variant({"objects": {"queries": "conditional"}}),
     "denoising queries": Variant({"objects": {"denoising_groups": 1}}),
     "random start": Variant(options={"init_from_data": False}),
-    "combined": Variant(
-        {
-            "objects": {
-                "loss_unit": "metres",
-                "position_unit": "cell",
-                "queries": "conditional",
-                "auxiliary_losses": True,
-            }
-        }
-    ),
+    "combined": Variant(COMBINED),
+    "combined, learning rate 3e-4": Variant(COMBINED, {"learning_rate": 3e-4}),
 }
 DETR_CHANGES = {
     name: Variant({"branches": "objects"} | dict(change.architecture), change.options)

@@ -9,6 +9,7 @@ import torch
 from helpers import random_scene, small_spec
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
+from torch import nn
 from torch.nn import functional as F
 
 from models.batch import LayoutBatch
@@ -19,7 +20,7 @@ from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset
 from models.tensors import encode_layout, make_layout_batch
 from models.training import ExecutionConfig, OptimizerConfig, Trainer, make_lvae_trainer, sample_corruption
 from models.vae.config import nest_flat_options, override_options
-from models.vae.detr_decoder import embed_positions
+from models.vae.detr_decoder import DecoderLayer, embed_positions
 from models.vae.ground import (
     HEIGHT_WEIGHT,
     LOGITS_PER_PX,
@@ -36,6 +37,7 @@ from models.vae.losses import (
 )
 from models.vae.matching import MatchWeights, match_primitives
 from models.vae.outputs import Posterior
+from models.vae.transformer import EncoderLayer
 
 
 def count_million_parameters(model) -> float:
@@ -405,6 +407,31 @@ def test_denoising_queries_know_their_primitive():
     output, _ = lvae(batch, torch.zeros(2, *lvae.latent_shape), query_noise=silence)
     found, truth = (part[batch.real][:, :3] for part in (output.denoised[-1].features, batch.features))
     assert (found - truth).abs().mean() < 0.1 < (output.features[batch.real][:, :3] - truth).abs().mean()
+
+
+def test_transformers_start_from_weights_of_torch_and_detr():
+    """DETR applies Xavier's initialisation to all matrices of torch's decoder layers; the encoder is torch's."""
+    torch.manual_seed(0)
+    width, heads, hidden = 256, 8, 512
+    theirs, encoder = nn.TransformerDecoderLayer(width, heads, hidden), nn.TransformerEncoderLayer(width, heads, hidden)
+    for parameter in theirs.parameters():
+        if parameter.dim() > 1:
+            nn.init.xavier_uniform_(parameter)
+    ours, our_encoder = DecoderLayer(width, heads, hidden), EncoderLayer(width, heads, hidden)
+    pairs = [(our_encoder.attention, our_encoder.mlp, encoder.self_attn, encoder)]
+    pairs += [(ours.self_attention, ours.mlp, theirs.self_attn, theirs)]
+    pairs += [(ours.cross_attention, ours.mlp, theirs.multihead_attn, theirs)]
+    for attention, mlp, their_attention, layer in pairs:
+        chunks = (*their_attention.in_proj_weight.chunk(3), their_attention.out_proj.weight)
+        projections = (attention.query, attention.key, attention.value, attention.out)
+        linear = ((mlp[0].weight, layer.linear1.weight), (mlp[2].weight, layer.linear2.weight))
+        weights = [(mine.weight, their) for mine, their in zip(projections, chunks, strict=True)] + list(linear)
+        for mine, their in weights:
+            assert mine.shape == their.shape and float((mine.std() / their.std()).detach()) == pytest.approx(
+                1, abs=0.02
+            )
+            assert float((mine.abs().max() / their.abs().max()).detach()) == pytest.approx(1, abs=0.02)
+        assert not any(bool(projection.bias.any()) for projection in projections)
 
 
 def test_position_embedding_equals_formula_of_detr():
