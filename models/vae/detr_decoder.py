@@ -35,6 +35,8 @@ from models.vae.outputs import Prediction, Proposals
 from models.vae.transformer import Attention, make_feed_forward
 
 CENTER = 3  # The first three features are the centre.
+WAVELENGTH_RATIO = {"map": 10_000, "cell": 20}  # Longest wavelength of position embeddings divided by the shortest.
+POSITION_GAIN = 2.5  # Gain of the initial projections of positions in conditional attention.
 ANCHOR_MARGIN = 0.02  # Smallest distance of an initial anchor from the border of the area, normalised.
 
 
@@ -47,8 +49,9 @@ def embed_positions(
         row_col: Row and column in latent cells. The middle of the first cell is at 0.5.
         size: Number of rows and of columns of the latent grid.
         width: Number of channels. One half encodes the row, the other half the column.
-        unit: "map": the highest frequency has one period per grid, as in the published settings of DETR. "cell": the
-            highest frequency has one period in 2 pi cells, as in Vaswani et al.
+        unit: "map": wavelengths from one to 10,000 grids, as in the published settings of DETR. "cell": wavelengths
+            from 2 pi cells to 20 times as much, so that neighbouring cells differ. The ratio is that of DAB-DETR (Liu
+            et al., ICLR 2022).
 
     Returns:
         Position embeddings.
@@ -56,24 +59,38 @@ def embed_positions(
     position = row_col + 0.5
     if unit == "map":
         position = position / size * 2 * torch.pi
-    wavelength = 10_000 ** (torch.arange(0, width // 2, 2, dtype=torch.float32, device=row_col.device) / (width // 2))
+    wavelength = WAVELENGTH_RATIO[unit] ** (
+        torch.arange(0, width // 2, 2, dtype=torch.float32, device=row_col.device) / (width // 2)
+    )
     angle = position[..., None] / wavelength  # (..., 2, d / 4)
     return torch.stack([angle.sin(), angle.cos()], dim=-1).flatten(-3)
 
 
 class ConditionalAttention(nn.Module):
-    """Cross-attention whose logits are the sum of a product of contents and a product of positions (Meng et al.)."""
+    """Cross-attention whose logits are the sum of a product of contents and a product of positions (Meng et al.).
 
-    def __init__(self, width: int, heads: int) -> None:
+    Except in the first layer, a network scales the position embedding of each query, depending on its content.
+
+    Unlike in Conditional DETR, the projections of both positions start with equal orthogonal weights, and the scales
+    start near 1. Each query therefore attends to the cells around its reference point from the first step.
+    """
+
+    def __init__(self, width: int, heads: int, is_first: bool = False) -> None:
         super().__init__()
         self.heads = heads
         names = ("query", "key", "value", "query_position", "key_position")
         self.projections = nn.ModuleDict({name: nn.Linear(width, width) for name in names})
-        self.scale = make_feed_forward(width, width)
+        self.scale = None if is_first else make_feed_forward(width, width)
         self.out = nn.Linear(width, width)
         for projection in self.projections.values():
             nn.init.xavier_uniform_(cast(nn.Linear, projection).weight)
             nn.init.zeros_(cast(nn.Linear, projection).bias)
+        of_query, of_key = (cast(nn.Linear, self.projections[f"{side}_position"]).weight for side in ("query", "key"))
+        nn.init.orthogonal_(of_query, POSITION_GAIN)
+        with torch.no_grad():
+            of_key.copy_(of_query)
+        if self.scale is not None:
+            nn.init.ones_(cast(nn.Linear, self.scale[2]).bias)
 
     def forward(self, query: Tensor, query_position: Tensor, memory: Tensor, memory_position: Tensor) -> Tensor:
         """Attend from queries to cells.
@@ -92,9 +109,14 @@ class ConditionalAttention(nn.Module):
             return self.projections[name](x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
 
         place = split("key_position", memory_position[None]).expand(len(memory), -1, -1, -1)
-        q = torch.cat([split("query", query), split("query_position", query_position * self.scale(query))], dim=-1)
+        if self.scale is not None:
+            query_position = query_position * self.scale(query)
+        q = torch.cat([split("query", query), split("query_position", query_position)], dim=-1)
         k = torch.cat([split("key", memory), place], dim=-1)
-        mixed = F.scaled_dot_product_attention(q, k, split("value", memory))
+        value = split("value", memory)
+        channels = value.shape[-1]
+        padded = F.pad(value, (0, channels))  # The fused kernels need as many channels as queries and keys have.
+        mixed = F.scaled_dot_product_attention(q, k, padded)[..., :channels]
         return self.out(mixed.transpose(1, 2).flatten(2))
 
 
@@ -104,10 +126,10 @@ class DecoderLayer(nn.Module):
     The initial weights have the distribution of DETR's.
     """
 
-    def __init__(self, width: int, heads: int, hidden: int, conditional: bool = False) -> None:
+    def __init__(self, width: int, heads: int, hidden: int, conditional: bool = False, is_first: bool = False) -> None:
         super().__init__()
         self.self_attention = Attention(width, heads)
-        self.cross_attention = ConditionalAttention(width, heads) if conditional else Attention(width, heads)
+        self.cross_attention = ConditionalAttention(width, heads, is_first) if conditional else Attention(width, heads)
         self.mlp = make_feed_forward(width, hidden)
         self.norm1, self.norm2, self.norm3 = nn.LayerNorm(width), nn.LayerNorm(width), nn.LayerNorm(width)
         for linear in (self.self_attention.out, self.cross_attention.out, self.mlp[0], self.mlp[2]):
@@ -187,7 +209,7 @@ class DETRDecoder(nn.Module):
         if self.groups:
             self.embed_noised = nn.Linear(FEATURES, width)
             self.embed_noised_category = nn.Parameter(torch.randn(len(slots), width))
-        layers = (DecoderLayer(width, heads, hidden, conditional) for _ in range(config.layers))
+        layers = (DecoderLayer(width, heads, hidden, conditional, is_first=k == 0) for k in range(config.layers))
         self.layers = nn.ModuleList(layers)
         self.heads = nn.ModuleList(OutputHeads(width, config.head_hidden) for _ in slots)
         register_computed_buffers(self)

@@ -20,7 +20,7 @@ from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset
 from models.tensors import encode_layout, make_layout_batch
 from models.training import ExecutionConfig, OptimizerConfig, Trainer, make_lvae_trainer, sample_corruption
 from models.vae.config import nest_flat_options, override_options
-from models.vae.detr_decoder import DecoderLayer, embed_positions
+from models.vae.detr_decoder import ConditionalAttention, DecoderLayer, embed_positions
 from models.vae.ground import (
     HEIGHT_WEIGHT,
     LOGITS_PER_PX,
@@ -387,7 +387,10 @@ def test_detr_options_add_losses_in_training_only(options):
     assert torch.isfinite(losses.total) and (losses.auxiliary > 0) == bool(output.auxiliary or groups)
     losses.total.backward()
     unused = {name for name, p in lvae.object_decoder.named_parameters() if p.grad is None or not p.grad.any()}
-    first = "layers.0.self_attention."  # In the paper's DETR, the values of this attention are zeros.
+    first = (
+        "layers.0.self_attention.",
+        "layers.0.norm1.weight",
+    )  # The values of the paper's first attention are zeros.
     unused = {name for name in unused if not name.startswith("heads.")}  # The batch has not all categories.
     assert all(name.startswith(first) for name in unused) and bool(unused) == (options == {})
     lvae.eval()
@@ -407,6 +410,25 @@ def test_denoising_queries_know_their_primitive():
     output, _ = lvae(batch, torch.zeros(2, *lvae.latent_shape), query_noise=silence)
     found, truth = (part[batch.real][:, :3] for part in (output.denoised[-1].features, batch.features))
     assert (found - truth).abs().mean() < 0.1 < (output.features[batch.real][:, :3] - truth).abs().mean()
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_conditional_attention_is_local_at_first(is_first):
+    """Before training, a query gets more than half of its values from the cells within 5 cells of its reference."""
+    torch.manual_seed(0)
+    attention = ConditionalAttention(64, 4, is_first)
+    cells = torch.cartesian_prod(torch.arange(32.0), torch.arange(32.0)) + 0.5
+    references = torch.rand(20, 2) * 32
+    near = torch.cdist(references, cells) < 5
+    with torch.no_grad():  # The output of each head is the share of its attention on near cells.
+        attention.projections["key"].weight.zero_()
+        attention.projections["value"].weight.copy_(torch.eye(64)[:1].expand(64, -1))
+        attention.out.weight.copy_(torch.eye(64))
+        sines = [embed_positions(points, 32, 64, "cell") for points in (references, cells)]
+        memory = torch.zeros(20, 1024, 64)
+        memory[..., 0] = near.float()
+        share = attention(torch.randn(20, 1, 64), sines[0][:, None], memory, sines[1]).mean(dim=2)
+    assert share.mean() > 0.5 > 0.1 > near.float().mean()
 
 
 def test_transformers_start_from_weights_of_torch_and_detr():
@@ -434,16 +456,19 @@ def test_transformers_start_from_weights_of_torch_and_detr():
 
 
 def test_position_embedding_equals_formula_of_detr():
-    """Carion et al.: sine and cosine of 2 pi y / h (then x / w), divided by 10000^(2 floor(k / 2) / (d / 2))."""
+    """Carion et al.: sine and cosine of 2 pi y / h (then x / w), divided by 10000^(2 floor(k / 2) / (d / 2)).
+
+    For the unit "cell", the angles are y and x, divided by powers of 20 as in DAB-DETR.
+    """
     size, width = 5, 16
     middle = torch.arange(size) + 0.5
-    for unit, scale in (("map", 2 * np.pi / size), ("cell", 1.0)):
+    for unit, scale, ratio in (("map", 2 * np.pi / size, 10_000), ("cell", 1.0, 20)):
         found = embed_positions(torch.cartesian_prod(middle, middle), size, width, unit).numpy()
         for cell in (0, 7, 24):
             want = []
             for position in (cell // size + 1, cell % size + 1):
                 for k in range(width // 2):
-                    angle = position * scale / 10_000 ** (2 * (k // 2) / (width // 2))
+                    angle = position * scale / ratio ** (2 * (k // 2) / (width // 2))
                     want.append(np.cos(angle) if k % 2 else np.sin(angle))
             assert np.allclose(found[cell], want, atol=1e-5)
 
