@@ -302,8 +302,8 @@ DETR_CHANGES = {
     "baseline": Variant(),
     "loss in metres": Variant({"objects": {"loss_unit": "metres"}}),
     "loss in cells": Variant({"objects": {"loss_unit": "cells"}}),
-    "learning rate 3e-4": Variant(options={"learning_rate": 3e-4}),
-    "learning rate 3e-3": Variant(options={"learning_rate": 3e-3}),
+    "learning rate 2.5e-4": Variant(options={"learning_rate": 2.5e-4}),
+    "learning rate 1e-3": Variant(options={"learning_rate": 1e-3}),
     "warm-up": Variant(options={"warmup_steps": 200}),
     "clipped gradients": Variant(options={"grad_clip": 1.0}),
     "auxiliary losses": Variant({"objects": {"auxiliary_losses": True}}),
@@ -314,7 +314,6 @@ DETR_CHANGES = {
     "denoising queries": Variant({"objects": {"denoising_groups": 1}}),
     "random start": Variant(options={"init_from_data": False}),
     "combined": Variant(COMBINED),
-    "combined, learning rate 3e-4": Variant(COMBINED, {"learning_rate": 3e-4}),
 }
 DETR_CHANGES = {
     name: Variant({"branches": "objects"} | dict(change.architecture), change.options)
