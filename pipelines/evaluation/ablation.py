@@ -463,11 +463,12 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
         "ap3d": "AP3D, %",
         "ap3d_50": "AP3D@50, %",
         "found_1m": "found within 1 m, %",
-        "median_center_error_m": "centre error, cm",
-        "control_center_error_m": "centre error with another latent, cm",
     }
     names = {name: text for name, text in names.items() if any(row[f"{name}_mean"] is not None for row in rows)}
     columns = ["variant", "parameters", "GFLOP", "seeds", "steps", "minutes", *names.values()]
+    error, control = "median_center_error_m_mean", "control_center_error_m_mean"
+    if has_errors := any(row[error] is not None for row in rows):
+        columns.append("centre error (control), cm")
     cells = []
     for row in rows:
         cell: list = [row["variant"], f"{row['parameters']:,}", round(row["gflops"], 2), row["seeds"], row["steps"]]
@@ -477,6 +478,8 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
             digits = ".2g" if name == "height_mse_normalised" else ".2f"
             known = None not in values
             cell.append("{} ({} to {})".format(*(format(100 * v, digits) for v in values)) if known else None)
+        if has_errors:
+            cell.append(None if row[error] is None else f"{100 * row[error]:.0f} ({100 * row[control]:.0f})")
         cells.append(cell)
     note = (
         "Scores are given as mean (minimum to maximum) over seeds. Scenes are reconstructed from the latent mean. "

@@ -120,8 +120,9 @@ def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys)
     assert (full["seeds"], full["steps"]) == (3, 7) and abs(full["ground_iou_mean"] - 0.91) < 1e-9
     assert (full["ground_iou_min"], full["ground_iou_max"]) == (0.9, 0.92) and bare["ap3d_mean"] == 0.5
     assert bare["ground_iou_mean"] is None and rows["without objects"]["ap3d_mean"] is None
+    assert rows["without ground"]["control_center_error_m_mean"] == 5.0
     printed = capsys.readouterr().out
-    assert "without latent split" in printed and "centre error, cm" in printed and "40.00 (40.00" in printed
+    assert "without" in printed and "split" in printed and "40 (500)" in printed
     with pytest.raises(ValueError, match="holds a study with steps=7, asked for 8"):
         job.compare_variants(job.Branches(preset="smoke", steps=8, num_seeds=2))
     with pytest.raises(ValueError, match=r"--only-variants \['without sky'\]: expected some of \['full model'"):

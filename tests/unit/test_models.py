@@ -199,8 +199,7 @@ def test_init_from_data_starts_outputs_at_means():
         errors = [(o.occupancy_logit.sigmoid().mean(dim=(0, 2, 3)) - mean).abs().mean() for o in (before, after)]
         assert errors[1] < 0.5 * errors[0]
         expected = batch.real.sum() / len(batch)
-        offered = [float(o.existence_logit.sigmoid().sum() / len(batch)) for o in (before, after)]
-        assert abs(offered[1] - expected) < 0.5 * abs(offered[0] - expected)
+        assert float(after.existence_logit.sigmoid().sum() / len(batch)) == pytest.approx(float(expected), rel=0.1)
 
 
 def test_distance_transform_equals_scipy():
@@ -322,7 +321,7 @@ def test_losses_equal_their_equations():
     assert np.isclose(float(compute_kl_loss(posterior)), float(want), rtol=1e-5)
 
 
-@pytest.mark.parametrize("decoder, steps, rate, clip", [("detr", 400, 3e-3, 0.1), ("cells", 250, 1e-2, np.inf)])
+@pytest.mark.parametrize("decoder, steps, rate, clip", [("detr", 400, 3e-3, 0.1), ("cells", 350, 1e-2, np.inf)])
 def test_lvae_overfits_one_batch(decoder, steps, rate, clip):
     """Both decoders find all 40 primitives of two scenes within 1 m, and no others. DETR's paper also clips at 0.1."""
     spec = small_spec()
