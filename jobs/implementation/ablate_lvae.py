@@ -154,7 +154,7 @@ def compare_variants(config: Branches) -> str:
                 if not storage.exists(path):
                     storage.write_json(train_variant(config, variant, seed, output), path)
                 scores.append(storage.read_json(path))
-                kept = {f"{make_slug(variant)}.{name}": scores[-1][name] for name in ablation.MEASURES}
+                kept = {f"{make_slug(variant)}.{name}": scores[-1].get(name) for name in ablation.MEASURES}
                 tracker.metrics({name: value for name, value in kept.items() if value is not None}, seed)
         rows, curves = ablation.group_by_variant(scores), ablation.draw_curve_chart(scores)
         table = ablation.build_variant_table(rows)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from itertools import chain, groupby, product
 from typing import Any
@@ -345,6 +345,7 @@ AUGMENTATIONS = {
     "mirrored and moved": Variant(options={"flip": True, "jitter": True}),
 }
 MEASURES = {"ground_iou": "ground", "height_mse_normalised": "ground", "height_rmse_m": "ground"}
+ACCURACY_SCENES = 128  # The driver holds these scenes in memory.
 OF_PRIMITIVES = ("ap3d", "ap3d_50", "found_1m", "median_center_error_m", "control_center_error_m")
 MEASURES |= dict.fromkeys(OF_PRIMITIVES, "objects")
 
@@ -366,14 +367,15 @@ def measure_accuracy(model: LayoutVAE, selection: SceneSubset, batch_size: int =
 
     Args:
         model: Layout VAE with the object branch.
-        selection: Scenes; at least two.
+        selection: Scenes, at least two. At most ACCURACY_SCENES of them are scored, evenly selected.
         batch_size: Number of scenes per forward pass.
 
     Returns:
         The scores of `Accuracy` by name, and `control_center_error_m`: the median centre error if each scene is
         decoded from the latent of another selected scene. A decoder that ignores the latent has equal errors.
     """
-    scenes = [scene for shard, rows in selection.shards() for scene in shard.scenes(rows)]
+    few = replace(selection, limit=min(selection.limit or ACCURACY_SCENES, ACCURACY_SCENES))
+    scenes = [scene for shard, rows in few.shards() for scene in shard.scenes(rows)]
     batches = [make_layout_batch(scenes[k : k + batch_size], model.spec) for k in range(0, len(scenes), batch_size)]
     latents = torch.cat([model.encode(batch).mean for batch in batches])
 
