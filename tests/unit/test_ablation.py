@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,11 +10,12 @@ import torch
 from helpers import random_scene, small_spec
 from scipy.spatial.transform import Rotation
 
+from models.batch import LayoutBatch
 from models.geometry.encodings import ENCODINGS, compute_harmonics, find_nearest_frame
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.presets import LVAE_PRESETS
-from models.scene import canonicalize_boxes, make_yaw_rotation
+from models.scene import Grid, canonicalize_boxes, make_yaw_rotation
 from models.studies.orientation_study import (
     BOX_DISTRIBUTIONS,
     OneObjectAutoencoder,
@@ -24,6 +26,8 @@ from models.studies.orientation_study import (
 from models.tensors import decode_layout, make_layout_batch
 from models.vae.config import override_options
 from models.vae.losses import compute_lvae_loss
+from models.vae.matching import MatchWeights
+from models.vae.outputs import LayoutOutput
 from pipelines.evaluation.ablation import (
     AUGMENTATIONS,
     BRANCHES,
@@ -37,7 +41,11 @@ from pipelines.evaluation.ablation import (
     compute_yaw_loss,
     draw_training_boxes,
     list_trials,
+    measure_accuracy,
 )
+from pipelines.preprocess.sources.town.generator import generate_town
+from pipelines.schema.scene_subset import SceneSubset
+from pipelines.schema.tables import Shard
 
 CUBE_SYMMETRIES = [
     np.diag(signs)[:, list(order)]
@@ -302,3 +310,29 @@ def test_study_without_trials_releases_its_directory(tmp_path):
     guard_study(str(tmp_path), {"dataset": "/somewhere"})
     with pytest.raises(ValueError, match='holds a study with dataset="/somewhere", asked for "/nowhere"'):
         guard_study(str(tmp_path), {"dataset": "/nowhere"})
+
+
+def test_decoder_that_ignores_latents_is_as_wrong_as_the_control(tmp_path):
+    """A perfect decoder has no error but fails with wrong latents; a decoder of one fixed scene has equal errors."""
+    spec = LayoutSpec()
+    scenes = [generate_town(1000).scene(k, "test", Grid()) for k in (0, 9, 20, 33)]
+    Shard(str(tmp_path), "town", "test", 0).write(scenes)
+    selection = SceneSubset(str(tmp_path), "town", "test")
+    first = make_layout_batch(scenes[:1], spec)
+
+    def encode(batch: LayoutBatch) -> SimpleNamespace:
+        return SimpleNamespace(mean=torch.cat([batch.features, batch.real[..., None].float()], dim=-1))
+
+    def decode(latent: torch.Tensor) -> LayoutOutput:
+        ground = torch.zeros(len(latent), *first.height.shape[1:])
+        logit = 18 * latent[..., 9] - 9
+        return LayoutOutput(ground, ground, latent[..., :9], logit, spec.slots, MatchWeights())
+
+    perfect = SimpleNamespace(spec=spec, encode=encode, decode=decode)
+    scores = measure_accuracy(perfect, selection, batch_size=3)
+    assert scores["median_center_error_m"] < 0.01 and scores["found_1m"] == 1
+    assert scores["control_center_error_m"] > 2
+    constant = encode(first).mean
+    blind = SimpleNamespace(spec=spec, encode=encode, decode=lambda z: decode(constant.expand(len(z), -1, -1)))
+    scores = measure_accuracy(blind, selection)
+    assert scores["median_center_error_m"] == scores["control_center_error_m"] > 1
