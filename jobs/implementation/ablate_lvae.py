@@ -139,6 +139,10 @@ def compare_variants(config: Branches) -> str:
     output = resolve_path(config.output, "ablations", config.name)
     if config.minutes <= 0 or config.num_seeds < 1:
         raise ValueError(f"--minutes is {config.minutes}, --num-seeds is {config.num_seeds}: both must be more than 0")
+    if config.max_scenes is not None and config.max_scenes < 2:
+        raise ValueError(
+            f"--max-scenes is {config.max_scenes}, expected 2 or more: the control decodes the latents of other scenes"
+        )
     find_preset(LVAE_PRESETS, config.preset)
     chosen = select_variants(config)
     guard_study(output, {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED})

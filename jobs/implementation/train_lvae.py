@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from jobs.implementation.checks import find_start, find_training_dataset, needs_smoke_inputs
+from jobs.implementation.checks import check_train_lvae, find_start, find_training_dataset, needs_smoke_inputs
 from jobs.implementation.smoke_inputs import make_smoke_dataset
 from jobs.support import trainer
 from jobs.support.callbacks import ReconstructionCheck
@@ -54,6 +54,7 @@ START_SCENES, START_SHARDS = 96, 16  # numbers of training scenes and shards fro
 
 def prepare(config: Config) -> TrainingRun:
     """Return the training run that the options describe; generate the smoke preset's dataset if it is missing."""
+    check_train_lvae(config)
     row = resolve_preset(config)
     root = find_training_dataset(config, row.source)
     if needs_smoke_inputs(config):

@@ -127,6 +127,8 @@ def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys)
         job.compare_variants(job.Branches(preset="smoke", steps=8, num_seeds=2))
     with pytest.raises(ValueError, match=r"--only-variants \['without sky'\]: expected some of \['full model'"):
         job.compare_variants(job.Branches(preset="smoke", steps=7, only_variants=("without sky",)))
+    with pytest.raises(ValueError, match="--max-scenes is 1, expected 2 or more"):
+        job.compare_variants(job.Branches(preset="smoke", max_scenes=1, name="another"))
     with pytest.raises(ValueError, match="unknown preset 'smokes'"):
         job.compare_variants(job.Branches(preset="smokes", name="another"))
     assert not (Path(output).parent / "another").exists()

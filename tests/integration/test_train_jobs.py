@@ -224,7 +224,7 @@ def test_train_lvae_starts_from_trained_weights(home):
     with pytest.raises(ValueError, match=r"--start-from .*its latent_channels is 4, but that of this preset is 16"):
         prepare(Config(preset="demo", name="other", dataset=dataset, start_from=str(model)))
     with pytest.raises(ValueError, match="exclude each other"):
-        check_train_lvae(Config(preset="smoke", name="both", start_from=str(model), train_object_decoder_of=str(model)))
+        prepare(Config(preset="smoke", name="both", start_from=str(model), train_object_decoder_of=str(model)))
     spec = small_spec()
     with pytest.raises(ValueError, match=r"which continues .* has another LayoutSpec: slots is"):
         load_start(str(model), LVAE_PRESETS["smoke"].architecture(), spec)

@@ -55,6 +55,9 @@ def test_plan_of_the_paper_has_its_presets_and_numbers():
     assert stages["preprocess the drives"].config.slots == "paper"
     nearest = make_plan(PLANS[2], FULL)[-1]
     assert nearest.name == "find the nearest training scenes of DiT-B" and nearest.config.max_scenes == 50_000
+    assert nearest.config.vgg16 == "v.pth" and not nearest.config.inception
+    for config in (Kitti360("/data", transformers=("l", "xl"), vgg16="v.pth"), Av2("/data", vgg16="v.pth")):
+        assert not any("nearest" in stage.name for stage in make_plan(config, FULL))
     for config in PLANS:
         for size in config.transformers:
             lvae, dit = find_presets(config, size)
