@@ -48,7 +48,7 @@ class Options:
     num_workers: int = 1
     """Number of training workers and of models that run in parallel; use one per GPU."""
     lvae_steps: int | None = None
-    """Number of training steps of the layout VAE (default: as in the preset; mini: 500)."""
+    """Number of training steps of the layout VAE (default: as in the preset; mini: 1000)."""
     dit_steps: int | None = None
     """Number of training steps of each transformer (default: as in the preset; mini: 1000)."""
     num_scenes: int | None = None

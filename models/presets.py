@@ -82,7 +82,7 @@ LVAE_PRESETS: dict[str, LVAEPreset] = {
     "kitti360": LVAEPreset("kitti360",  256, PAPER, 32,    300_000, init_from_data=False),
     "av2":      LVAEPreset("av2",       256, PAPER, 32,    300_000, init_from_data=False),
     # The networks of `kitti360` with fewer layers and less width, for two cores. It starts from the means of the data.
-    "kitti360-mini": LVAEPreset("kitti360", 256, MINI, 8, 3_000, learning_rate=5e-4),
+    "kitti360-mini": LVAEPreset("kitti360", 256, MINI, 4, 6_000, learning_rate=5e-4),
     # This preset combines the paper's object encoder with the town's ground branch and the cell decoder.
     # The latent has the same shape as in the paper, but training costs less.
     "kitti360-light": LVAEPreset("kitti360", 256, replace(TOWN, objects=PAPER_CELLS), 32, 300_000,

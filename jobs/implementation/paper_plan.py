@@ -21,7 +21,7 @@ from jobs.train_lvae import Config as LVAEConfig
 from models.presets import DIT_PRESETS, LVAE_PRESETS
 from pipelines.schema.splits import TEST, TRAIN
 
-MINI_SCENES, MINI_LVAE_STEPS, MINI_DIT_STEPS = 96, 500, 1000
+MINI_SCENES, MINI_LVAE_STEPS, MINI_DIT_STEPS = 96, 1000, 1000
 PAPER_SCENES = 1000  # Scenes for precision and recall.
 NEAREST_SCENES = 50_000  # Generated and training scenes of supplement G.
 SWEEPS_PER_LOG = 156.5  # Argoverse 2: 313 sweeps in two logs.
