@@ -75,10 +75,11 @@ def convert_to_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
 
 
 def count_threads(local_workers: int) -> int:
-    """Return the number of threads for torch: the CPUs of this node, divided by its workers."""
+    """Return the number of threads for torch: the CPUs of this node on which this process may run, per worker."""
     node = ray.get_runtime_context().get_node_id()
     cpus = next(found["Resources"].get("CPU", 1.0) for found in ray.nodes() if found["NodeID"] == node)
-    return max(1, int(cpus) // local_workers)
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else int(cpus)  # Not on macOS.
+    return max(1, min(int(cpus), allowed) // local_workers)
 
 
 def train_worker(run: TrainingRun) -> None:
