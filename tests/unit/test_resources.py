@@ -1,7 +1,10 @@
 """Tests of counting and requesting the resources of a cluster."""
 
+from types import SimpleNamespace
+
 import pytest
 
+from jobs.support import trainer
 from pipelines.runtime import resources
 from pipelines.runtime.resources import ResourcePolicy, count_room, require_room, set_resource_policy
 
@@ -61,3 +64,14 @@ def test_gpus_are_not_replaced_by_cpus(nodes):
 def test_invalid_policy_is_refused(values):
     with pytest.raises(ValueError, match="expected a"):
         ResourcePolicy(**values)
+
+
+@pytest.mark.parametrize(
+    ("cpus", "allowed", "workers", "threads"), [(8, 8, 2, 4), (8, 2, 1, 2), (2, 8, 1, 2), (2, 1, 4, 1)]
+)
+def test_threads_stay_within_allowed_cpus(monkeypatch, cpus, allowed, workers, threads):
+    monkeypatch.setattr(trainer.os, "sched_getaffinity", lambda pid: set(range(allowed)), raising=False)
+    monkeypatch.setattr(trainer.ray, "get_runtime_context", lambda: SimpleNamespace(get_node_id=lambda: "b"))
+    nodes = [{"NodeID": "a", "Resources": {"CPU": 64.0}}, {"NodeID": "b", "Resources": {"CPU": float(cpus)}}]
+    monkeypatch.setattr(trainer.ray, "nodes", lambda: nodes)
+    assert trainer.count_threads(workers) == threads
