@@ -1,10 +1,10 @@
-"""Measure sampling and training of the paper's networks on a GPU, without Ray and without a network.
+"""Measure sampling and training of the paper's networks on a GPU, without Ray and without internet access.
 
-    python benchmarks/gpu.py --output DIR                          all sections, at most 8 minutes each
+    python benchmarks/gpu.py --output DIR                          all sections; `learn` stops after 8 minutes
     python benchmarks/gpu.py --output DIR --only latency train_dit
     python benchmarks/gpu.py --output DIR --only learn --scenes town.safetensors      continues where it stopped
     python benchmarks/gpu.py --output DIR --cpu                    rehearsal with tiny networks, a minute
-    python benchmarks/gpu.py --write-scenes town.safetensors       town scenes for train_lvae and learn
+    python benchmarks/gpu.py --write-scenes town.safetensors       town scenes for train_lvae, precision, learn
 
 The script needs models/ and its packages. Where this project is not installed, set PYTHONPATH=. in its root. Only
 --write-scenes also needs pipelines/.
@@ -62,7 +62,7 @@ from models.vae import losses
 from models.vae.accuracy import compute_accuracy, pair_primitives
 
 ROOT = Path(__file__).parents[1]
-SECTION_SECONDS = 480.0
+LEARN_SECONDS = 480.0
 FIELDS = ("height", "occupied", "features", "real")
 MAX_SCENES_BYTES = 20_000_000
 HELD_OUT = 16  # Scenes of `learn` that are not trained on.
@@ -132,7 +132,7 @@ class Setup:
         return LayoutVAE(layout=self.spec(row).to_dict(), **row.architecture())
 
     def make_pipeline(self, name: str) -> PrITTIPipeline:
-        """Return a pipeline with random weights on the device; the encoders stay on the CPU."""
+        """Return a pipeline with random weights on the device; the encoders remain on the CPU."""
         row = self.dit_preset(name)
         lvae = self.make_lvae(row.lvae)
         channels, size, _ = lvae.latent_shape
@@ -245,7 +245,8 @@ def run_throughput(setup: Setup) -> Iterator[Row]:
             denoise = pipeline.make_denoiser(torch.tensor([500]), classes)
             seconds = setup.time_call(partial(denoise, latent, timestep, classes), setup.choose(20, 3), 3)
             rate, mfu = batch / (250 * seconds), setup.measure_mfu(batch * operations, seconds)
-            yield Row(f"{label}, sampling, batch {batch}", rate, "scenes/s", note="250 steps, no decoding")
+            note = "250 steps, extrapolated from one; no decoding"
+            yield Row(f"{label}, sampling, batch {batch}", rate, "scenes/s", note=note)
             yield Row(f"{label}, MFU of a denoising step, batch {batch}", 100 * mfu, "%")
 
 
@@ -295,7 +296,7 @@ def write_scenes(path: Path, count: int) -> None:
     size = path.stat().st_size
     if size > MAX_SCENES_BYTES:
         path.unlink()
-        raise ValueError(f"{count} scenes need {size:,} bytes, at most {MAX_SCENES_BYTES:,} travel; use --num-scenes")
+        raise ValueError(f"{count} scenes need {size:,} bytes, more than {MAX_SCENES_BYTES:,}; lower --num-scenes")
     print(f"{path}: {count} scenes, {size:,} bytes")
 
 
@@ -304,7 +305,7 @@ class Layouts:
 
     Args:
         setup: Options.
-        spec: Layout of the scenes. Layouts of a file must have it.
+        spec: Layout of the scenes. The rasters of a file must have its resolution.
     """
 
     def __init__(self, setup: Setup, spec: LayoutSpec) -> None:
@@ -392,7 +393,7 @@ def find_fitting_batch(batch: int, attempt: Callable[[int], object]) -> int:
             batch //= 2
         else:
             return batch
-    raise ValueError("one sample does not fit in the memory of this GPU; use a smaller preset")
+    raise ValueError("one sample does not fit in the memory of this GPU; use a GPU with more memory")
 
 
 def count_training_step(trainer: Trainer) -> float:
@@ -502,14 +503,14 @@ def measure_primitives(model: LayoutVAE, arrays: dict[str, torch.Tensor]) -> dic
     accuracy = compute_accuracy(pair_primitives(model.decode(model.encode(batch).mean), batch, model.spec))
     return {
         "median centre error (m)": accuracy.median_center_error_m,
-        "primitives found within 1 m (%)": 100 * accuracy.found_1m,
-        "proposals within 1 m of a primitive (%)": 100 * accuracy.right_1m,
+        "recall of primitives within 1 m (%)": 100 * accuracy.recall_1m,
+        "precision of proposals within 1 m (%)": 100 * accuracy.precision_1m,
         "IoU3D of matched primitives (%)": 100 * accuracy.mean_iou3d,
     }
 
 
 def run_learn(setup: Setup) -> Iterator[Row]:
-    """Train a layout VAE on the scenes for at most SECTION_SECONDS, from the last checkpoint."""
+    """Train a layout VAE on the scenes for at most LEARN_SECONDS, from the last checkpoint."""
     if not setup.scenes and not setup.tiny:
         raise ValueError("learn needs --scenes FILE; make it with --write-scenes FILE")
     row = setup.lvae_preset("kitti360")
@@ -519,7 +520,7 @@ def run_learn(setup: Setup) -> Iterator[Row]:
     if (folder / "state.json").exists():
         trainer.load(folder)
     first, started, curve = trainer.steps_done, time.monotonic(), []
-    while trainer.steps_done < steps and time.monotonic() - started < SECTION_SECONDS - 60:
+    while trainer.steps_done < steps and time.monotonic() - started < LEARN_SECONDS - 60:
         found = trainer.step(layouts.draw(trainer.steps_done, batch), range(batch))
         if trainer.steps_done % 50 == 0 or trainer.steps_done == steps:
             curve.append((trainer.steps_done, {name: float(value) for name, value in found.items()}))
@@ -586,7 +587,7 @@ def format_table(results: dict) -> str:
 
 
 def run_sections(setup: Setup, names: list[str]) -> int:
-    """Run sections and merge their rows with those of earlier runs; return the number of failed sections."""
+    """Run sections and replace their rows in the results of earlier runs; return the number of failed sections."""
     path, failed = setup.output / "gpu.json", 0
     setup.output.mkdir(parents=True, exist_ok=True)
     results = json.loads(path.read_text()) if path.exists() else {}
@@ -619,7 +620,7 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=20_000, help="training steps of learn (default: 20000)")
     parser.add_argument("--peak-tflops", type=float, default=989.0, help="peak in bfloat16 (default: 989, H100)")
     parser.add_argument("--cpu", action="store_true", help="rehearse with tiny networks on the CPU")
-    parser.add_argument("--write-scenes", type=Path, metavar="FILE", help="write town scenes to this file, and end")
+    parser.add_argument("--write-scenes", type=Path, metavar="FILE", help="write town scenes to this file, and exit")
     parser.add_argument("--num-scenes", type=int, default=256, help="number of scenes to write (default: 256)")
     options = parser.parse_args()
     if options.write_scenes:

@@ -4,7 +4,7 @@
     jobs/ablate_lvae.py encoding            Cholesky, quaternion and octahedral encodings, on synthetic boxes
     jobs/ablate_lvae.py branches            without latent split, objects or ground, on $PRITTI_HOME/datasets/town
     jobs/ablate_lvae.py decoders            the cell decoder and the paper's DETR decoder, at equal time
-    jobs/ablate_lvae.py detr --dataset DIR  single changes of the DETR decoder or its training, at equal time
+    jobs/ablate_lvae.py detr --dataset DIR  changes of the DETR decoder or its training, at equal time
     jobs/ablate_lvae.py ground              sizes of the ground branch, at equal time
     jobs/ablate_lvae.py augmentation        mirrored scenes and moved vehicles
     jobs/ablate_lvae.py branches --dataset DIR --minutes 60 --num-seeds 5
@@ -105,7 +105,10 @@ class Decoders(Branches):
 
 @dataclass(frozen=True)
 class Detr(Branches):
-    """Compare single changes of the DETR decoder or its training, without the ground branch, for equal time."""
+    """Compare changes of the DETR decoder or its training, without the ground branch, for equal time.
+
+    Each change is made alone, and four of them are combined.
+    """
 
     preset: tyro.conf.Positional[str] = "kitti360-mini"
     """Preset with a DETR decoder: smoke, kitti360, kitti360-mini or av2."""

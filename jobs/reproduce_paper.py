@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Train and evaluate the paper's models, and write its tables with both numbers.
+"""Train and evaluate the paper's models, and write its tables with the paper's and the reproduced numbers.
 
     jobs/reproduce_paper.py kitti360 --input KITTI-360 --dry-run          the plan, with times and disk space
     jobs/reproduce_paper.py kitti360 --input KITTI-360 --num-workers 4 --inception FILE
@@ -8,9 +8,9 @@
 
 The job preprocesses the drives, trains the layout VAE, encodes latents, trains the transformers, samples scenes and
 evaluates them. It writes tables.html, tables.md and tables.json. Each row holds the paper's number and the reproduced
-number. Where they exist, it also holds a ceiling (other real scenes, or layouts that are decoded without a network) and
-a control (damaged scenes). A remark names missing values. First it prints the plan: the command of each
-stage, its time and the disk space. Run the same command again to resume after an interruption.
+number. Where they exist, it also holds a ceiling (other real scenes, or scenes converted to layout tensors and back,
+without a network) and a control (damaged scenes). A remark names missing values. First it prints the plan: the command
+of each stage, its time and the disk space. Run the same command again to resume after an interruption.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, Wait
 
 
 @dataclass(frozen=True)
-class Options:
+class PaperOptions:
     """Options of both datasets."""
 
     input: str
     """Root directory of the raw dataset."""
     scale: Literal["paper", "mini"] = "paper"
-    """Size of the networks and number of steps: as in the paper, or a rehearsal of minutes without a GPU."""
+    """Size of the networks and number of steps: as in the paper, or a rehearsal of about an hour on two cores."""
     output: str = ""
     """Directory to write all files to: data, runs, models, tables, and MLflow's database if it is local (default:
     $PRITTI_HOME/paper-<dataset>)."""
@@ -44,7 +44,8 @@ class Options:
     inception: str = ""
     """File of Inception weights for precision, recall, FID and Inception score (default: none)."""
     vgg16: str = ""
-    """File of VGG16 weights for the distances to the nearest training scene, supplement G (default: none)."""
+    """File of VGG16 weights for the distances to the nearest training scene, supplement G (only DiT-B on
+    KITTI-360; default: none)."""
     num_workers: int = 1
     """Number of training workers and of models that run in parallel; use one per GPU."""
     lvae_steps: int | None = None
@@ -66,12 +67,12 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Kitti360(Options):
-    """Reproduce the tables of KITTI-360: voxels, boxes and generation (Tab. 1 to 3 of the paper)."""
+class Kitti360(PaperOptions):
+    """Reproduce the tables of KITTI-360: voxels, boxes, generation (Tab. 1 to 3) and memorisation (supplement G)."""
 
 
 @dataclass(frozen=True)
-class Av2(Options):
+class Av2(PaperOptions):
     """Reproduce the table of Argoverse 2 (supplement); --input holds train/ and val/ of the sensor dataset."""
 
 

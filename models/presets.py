@@ -25,7 +25,7 @@ class LVAEPreset:
         model: Architecture.
         batch_size: Samples per step.
         steps: Number of training steps.
-        learning_rate: Initial learning rate.
+        learning_rate: Learning rate at the start of the decay. During a warm-up, it rises to this value.
         final_learning_rate: Learning rate of the last step.
         weight_decay: Weight decay of AdamW.
         warmup_steps: Number of initial steps during which the learning rate rises linearly.
@@ -35,8 +35,8 @@ class LVAEPreset:
         latent_noise: Scale of the noise that is added to training latents. The noise makes decoders tolerate errors in
             sampled latents. The paper adds no noise.
         init_from_data: If True, training starts from the means of the data and a small posterior variance
-            (`LayoutVAE.init_from_data`). If False, it starts from the random weights of torch, because the paper
-            mentions no other start.
+            (`LayoutVAE.init_from_data`). If False, it starts from random weights, those of DETR in the
+            transformers and those of torch elsewhere, because the paper mentions no other start.
     """
 
     source: str

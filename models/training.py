@@ -41,7 +41,7 @@ class OptimizerConfig:
 
     Attributes:
         steps: Number of training steps.
-        learning_rate: Initial learning rate.
+        learning_rate: Learning rate at the start of the decay. During a warm-up, it rises to this value.
         weight_decay: Weight decay.
         final_learning_rate: Learning rate of the last step; None: the learning rate is constant.
         warmup_steps: Number of initial steps during which the learning rate rises linearly.

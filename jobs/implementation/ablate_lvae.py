@@ -101,7 +101,7 @@ def plan_trials(config: Encoding) -> list:
     """Return the trials of all three kinds of boxes."""
     trials = ablation.list_trials("vehicle", config.train_sizes, config.num_seeds)
     if config.yaw_only_train_sizes:
-        trials += ablation.list_trials("vehicle", config.yaw_only_train_sizes, config.num_seeds, "moving")
+        trials += ablation.list_trials("vehicle", config.yaw_only_train_sizes, config.num_seeds, "varying")
     if config.any_footprint_train_sizes:
         trials += ablation.list_trials("any", config.any_footprint_train_sizes, config.num_seeds)
     return trials
@@ -119,7 +119,7 @@ def write_encoding_report(
     figure, cost = ablation.draw_size_chart(rows, "vehicle"), ablation.draw_yaw_chart(losses)
     charts = [figure, cost]
     if config.yaw_only_train_sizes:
-        charts.append(ablation.draw_size_chart(rows, "vehicle", "moving"))
+        charts.append(ablation.draw_size_chart(rows, "vehicle", "varying"))
     if config.any_footprint_train_sizes:
         charts.append(ablation.draw_share_chart(rows, "any", max(config.any_footprint_train_sizes)))
     tables = [table, *([footprints] if footprints else []), angles]
@@ -178,11 +178,11 @@ def select_variants(config: Branches) -> dict[str, Variant]:
         ValueError: The study has no variant of that name.
     """
     studies = {
-        Branches: ablation.BRANCHES,
-        Decoders: ablation.DECODERS,
-        Detr: ablation.DETR_CHANGES,
-        Ground: ablation.GROUND,
-        Augmentation: ablation.AUGMENTATIONS,
+        Branches: ablation.BRANCH_VARIANTS,
+        Decoders: ablation.DECODER_VARIANTS,
+        Detr: ablation.DETR_VARIANTS,
+        Ground: ablation.GROUND_VARIANTS,
+        Augmentation: ablation.AUGMENTATION_VARIANTS,
     }
     known = studies[type(config)]
     if unknown := set(config.only_variants) - set(known):

@@ -32,13 +32,13 @@ EVALUATE_S = 0.64
 PAPER_LVAE_GPU_H, PAPER_DIT_GPU_H, PAPER_SAMPLE_S = 72.0, 288.0, {"b": 0.58, "l": 1.78, "xl": 2.11}
 ENCODE_GPU_S = 0.01  # Assumed.
 # Guesses for two cores, not measured: seconds per step, and per scene with 250 denoising steps.
-MINI_LVAE_STEP_S, MINI_DIT_STEP_S, MINI_SAMPLE_S, MINI_ENCODE_S, MINI_RECONSTRUCT_S = 2.0, 0.15, 2.0, 0.1, 0.5
+MINI_LVAE_STEP_S, MINI_DIT_STEP_S, MINI_SAMPLE_S, MINI_ENCODE_S, RECONSTRUCT_S = 2.0, 0.15, 2.0, 0.1, 0.5
 MEASURED, GUESSED = "rates of benchmarks/cost_rates.py, two cores", "a guess for two cores, not measured"
 BYTES_PER_WEIGHT, KEPT_CHECKPOINTS = 20, 2  # Weights, EMA, two moments of AdamW and the model, in float32.
 WEIGHTS = {"lvae": 93.1e6, "b": 130e6, "l": 458e6, "xl": 675e6}
 MINI_WEIGHTS = 4e6
 
-Options = Kitti360 | Av2
+PaperConfig = Kitti360 | Av2
 
 
 @dataclass(frozen=True)
@@ -63,24 +63,27 @@ class Stage:
 
     @property
     def command(self) -> str:
-        """Command line that does the same."""
+        """Equivalent command line."""
         return format_command(self.job, self.config)
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Number of poses per split of the raw dataset. Scenes without ground or with gaps are rejected later."""
+    """Number of poses per split of the raw dataset, for Argoverse 2 estimated from the number of logs.
+
+    Scenes without ground or with gaps are rejected later.
+    """
 
     train: int
     test: int
 
 
-def find_source(config: Options) -> str:
+def find_source(config: PaperConfig) -> str:
     """Return the name of the dataset: kitti360 or av2."""
     return type(config).__name__.lower()
 
 
-def make_drives_config(config: Options) -> Kitti360Drives | Av2Drives:
+def make_drives_config(config: PaperConfig) -> Kitti360Drives | Av2Drives:
     """Return the options of preprocessing."""
     source = find_source(config)
     root, output = make_absolute(config.input), home_path("datasets", source)
@@ -89,8 +92,8 @@ def make_drives_config(config: Options) -> Kitti360Drives | Av2Drives:
     return Av2Drives(root, output, config.if_busy, skip_unreadable=config.skip_unreadable)
 
 
-def count_poses(config: Options) -> Counts:
-    """Count the poses of the raw dataset, from the files of poses only.
+def count_poses(config: PaperConfig) -> Counts:
+    """Count the poses of KITTI-360 in its files of poses, or estimate those of Argoverse 2 from the number of logs.
 
     Raises:
         ValueError: A split has no poses, or the protocol needs more training poses or generated scenes.
@@ -120,7 +123,7 @@ def count_poses(config: Options) -> Counts:
     return found
 
 
-def make_plan(config: Options, counts: Counts) -> list[Stage]:
+def make_plan(config: PaperConfig, counts: Counts) -> list[Stage]:
     """Return the stages in order.
 
     Args:
@@ -133,7 +136,7 @@ def make_plan(config: Options, counts: Counts) -> list[Stage]:
     return list(_list_stages(config, counts))
 
 
-def find_presets(config: Options, size: str) -> tuple[str, str]:
+def find_presets(config: PaperConfig, size: str) -> tuple[str, str]:
     """Return the names of the presets of the layout VAE and of a transformer."""
     source = find_source(config)
     if config.scale == "mini":
@@ -141,12 +144,12 @@ def find_presets(config: Options, size: str) -> tuple[str, str]:
     return source, source if size == "b" else f"{source}-{size}"
 
 
-def count_scenes(config: Options, counts: Counts) -> int:
+def count_scenes(config: PaperConfig, counts: Counts) -> int:
     """Return the number of scenes to generate per transformer."""
     return config.num_scenes or (MINI_SCENES if config.scale == "mini" else max(counts.train, PAPER_SCENES))
 
 
-def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
+def _list_stages(config: PaperConfig, counts: Counts) -> Iterator[Stage]:
     source, mini, workers = find_source(config), config.scale == "mini", config.num_workers
     data, total = home_path("datasets", source), counts.train + counts.test
     names = ("gpus", "wait_for_resources_s", "if_busy")
@@ -171,7 +174,7 @@ def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
         LVAEConfig(preset, data, num_workers=workers, steps=chosen, seed=config.seed, **shared),
         steps * MINI_LVAE_STEP_S / 3600 if mini else share * PAPER_LVAE_GPU_H / workers,
         weights * BYTES_PER_WEIGHT * KEPT_CHECKPOINTS / 1e9,
-        GUESSED if mini else f"the paper's {PAPER_LVAE_GPU_H:g} hours on one A100",
+        GUESSED if mini else f"the paper's {PAPER_LVAE_GPU_H:g} GPU hours on A100",
     )
     yield Stage(
         "encode latents",
@@ -191,7 +194,7 @@ def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
             num_actors=workers,
             **shared,
         ),
-        counts.test * MINI_RECONSTRUCT_S / 3600,
+        counts.test * RECONSTRUCT_S / 3600,
         counts.test * 1e4 / 1e9,
         GUESSED,
     )
@@ -203,13 +206,15 @@ def _list_stages(config: Options, counts: Counts) -> Iterator[Stage]:
             Branches(preset, data, steps=steps, num_seeds=1, only_variants=variants, num_workers=workers, **shared),
             3 * (steps * MINI_LVAE_STEP_S / 3600 if mini else share * PAPER_LVAE_GPU_H / workers),
             3 * weights * BYTES_PER_WEIGHT * KEPT_CHECKPOINTS / 1e9,
-            GUESSED if mini else f"the paper's {PAPER_LVAE_GPU_H:g} hours on one A100 per variant",
+            GUESSED if mini else f"the paper's {PAPER_LVAE_GPU_H:g} GPU hours on A100 per variant",
         )
     for size in config.transformers:
         yield from _list_transformer_stages(config, counts, size, data, shared)
 
 
-def _list_transformer_stages(config: Options, counts: Counts, size: str, data: str, shared: dict) -> Iterator[Stage]:
+def _list_transformer_stages(
+    config: PaperConfig, counts: Counts, size: str, data: str, shared: dict
+) -> Iterator[Stage]:
     mini, workers = config.scale == "mini", config.num_workers
     preset, scenes, title = find_presets(config, size)[1], count_scenes(config, counts), f"DiT-{size.upper()}"
     full = DIT_PRESETS[preset].steps
@@ -232,7 +237,7 @@ def _list_transformer_stages(config: Options, counts: Counts, size: str, data: s
         ),
         steps * MINI_DIT_STEP_S / 3600 if mini else steps / full * PAPER_DIT_GPU_H / workers,
         weights * BYTES_PER_WEIGHT * KEPT_CHECKPOINTS / 1e9,
-        GUESSED if mini else f"the paper's {PAPER_DIT_GPU_H:g} hours on A100",
+        GUESSED if mini else f"the paper's {PAPER_DIT_GPU_H:g} GPU hours on A100",
     )
     per_scene = MINI_SAMPLE_S if mini else PAPER_SAMPLE_S[size]
     yield Stage(

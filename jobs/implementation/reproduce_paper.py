@@ -20,7 +20,7 @@ from jobs.implementation.evaluate_scenes import evaluate
 from jobs.implementation.paper_plan import (
     NEAREST_SCENES,
     PAPER_SCENES,
-    Options,
+    PaperConfig,
     Stage,
     count_poses,
     find_presets,
@@ -56,16 +56,17 @@ GIGABYTE = 1e9
 CONTROL = "objects moved by up to 4 m"
 
 
-def main(config: Options) -> None:
+def main(config: PaperConfig) -> None:
     source = find_source(config)
     home = make_absolute(config.output) if config.output else home_path(f"paper-{source}")
-    check_weights(config)
+    check_options(config)
     os.environ["PRITTI_HOME"] = home
     if not is_uri(home):  # The job writes all files under the output directory.
         os.environ.pop("MLFLOW_TRACKING_URI", None)
     counts = count_poses(config)
     plan = make_plan(config, counts)
-    print(f"{make_absolute(config.input)}: {counts.train:,} training poses, {counts.test:,} test poses")
+    about = "about " if isinstance(config, Av2) else ""
+    print(f"{make_absolute(config.input)}: {about}{counts.train:,} training poses, {about}{counts.test:,} test poses")
     print_plan(plan, home)
     if config.dry_run:
         return
@@ -78,8 +79,12 @@ def main(config: Options) -> None:
     stages.run("write the tables", lambda: write_tables(config, stages.seconds))
 
 
-def check_weights(config: Options) -> None:
-    """Raise an error before hours are spent if a file is missing or an option does not fit the dataset."""
+def check_options(config: PaperConfig) -> None:
+    """Check the files of weights and the transformers before the first stage.
+
+    Raises:
+        ValueError: A file is missing, or the paper has no such transformer on the dataset.
+    """
     for option, path in (("--inception", config.inception), ("--vgg16", config.vgg16)):
         if path and not storage.exists(make_absolute(path)):
             raise ValueError(f"{option} {path} does not exist")
@@ -93,14 +98,14 @@ def check_weights(config: Options) -> None:
 
 
 def print_plan(plan: list[Stage], home: str) -> None:
-    """Print the stages with their estimates, and the commands that do the same."""
+    """Print the stages with their estimates and equivalent commands."""
     table = Columns("stage", "hours", "GB", "basis of the time")
     for stage in plan:
         table.add_row(stage.name, f"{stage.hours:,.2f}", f"{stage.gigabytes:,.2f}", stage.basis)
     total = (sum(s.hours for s in plan), sum(s.gigabytes for s in plan))
     table.add_row("total", f"{total[0]:,.1f}", f"{total[1]:,.1f}", "")
     Console(width=max(100, Console().width)).print(table)
-    print("Estimates; the stages are these commands:")
+    print("All numbers are estimates. These commands do the same:")
     print(f"  export PRITTI_HOME={shlex.quote(home)}")
     for stage in plan:
         print(f"  {stage.command}")
@@ -123,7 +128,7 @@ def require_space(plan: list[Stage], home: str) -> None:
         )
 
 
-def require_gpus(config: Options) -> None:
+def require_gpus(config: PaperConfig) -> None:
     """Raise an error if the networks of the paper would be trained on CPUs.
 
     Raises:
@@ -142,7 +147,7 @@ def count_gpus() -> float:
     return ray.cluster_resources().get("GPU", 0)
 
 
-def write_tables(config: Options, seconds: Mapping[str, float]) -> list[dict]:
+def write_tables(config: PaperConfig, seconds: Mapping[str, float]) -> list[dict]:
     """Compare all scores with the paper, and write tables.html, tables.md and tables.json."""
     source = find_source(config)
     found = collect_scores(config)
@@ -162,14 +167,14 @@ def write_tables(config: Options, seconds: Mapping[str, float]) -> list[dict]:
     return rows
 
 
-def describe_run(config: Options) -> list[str]:
-    """Return sentences that state how this run differs from the paper."""
+def describe_run(config: PaperConfig) -> list[str]:
+    """Return sentences that describe the run."""
     source = find_source(config)
     dataset = Dataset.open(home_path("datasets", source))
-    lvae, dit = find_presets(config, config.transformers[0])
+    presets = dict.fromkeys(name for size in config.transformers for name in find_presets(config, size))
     described = [
         f"Dataset {source}: {make_absolute(config.input)}, {dataset.spec.num_slots} slots per scene.",
-        f"Presets {lvae} and {dit}, seed {config.seed}.",
+        f"Presets {', '.join(presets)}; seed {config.seed}.",
         "The ceiling of a reconstruction is the scene encoded as a layout and decoded again without a network; its"
         f" control also has {CONTROL} and the ground shifted by 4 m. The ceiling of a generation score is the score of"
         f" other real scenes, its control that of real scenes with {CONTROL}.",
@@ -179,7 +184,7 @@ def describe_run(config: Options) -> list[str]:
     return described
 
 
-def collect_scores(config: Options) -> Reproduced:
+def collect_scores(config: PaperConfig) -> Reproduced:
     """Read the scores of all evaluations, and score the ceiling and the control of the reconstruction."""
     source = find_source(config)
     data = home_path("datasets", source)
@@ -210,8 +215,9 @@ def collect_scores(config: Options) -> Reproduced:
             notes["fid"] = "all training scenes; the test split is too small for a ceiling of the same size"
             notes["inception_score"] = "of all generated scenes; ceiling and control: of 1,000"
         else:
-            count = f"{scores['scenes']['generated']} scenes instead of {PAPER_SCENES:,}"
-            notes |= dict.fromkeys(("precision_k3", "recall_k3", "fid", "inception_score"), count)
+            count = f"{scores['scenes']['generated']:,} scenes instead of"
+            notes |= dict.fromkeys(("precision_k3", "recall_k3"), f"{count} {PAPER_SCENES:,}")
+            notes |= dict.fromkeys(("fid", "inception_score"), f"{count} as many as the training split has")
         if "sets" not in scores:
             notes |= dict.fromkeys(("precision_k3", "recall_k3", "fid_small"), "too few test scenes for a ceiling")
         nearest = f"{size}-precision" if config.scale == "mini" else f"{size}-nearest"

@@ -40,7 +40,7 @@ from pipelines.training.latents import digest_weights
 
 Wrap = Callable[[torch.nn.Module], torch.nn.Module]
 RETRIES = 2  # maximum number of restarts without a new checkpoint between them
-TELL_S = 1.0  # time between two messages of rank 0 to the driver
+REPORT_S = 1.0  # time between two messages of rank 0 to the driver
 LINE_S = 60.0  # longest time between two lines of the log, if steps are slower than `log_every` expects
 
 
@@ -99,7 +99,7 @@ def train_worker(run: TrainingRun) -> None:
     positions = split_batch(run.stream.batch_size, rank, world)
     weight = len(positions) * world / run.stream.batch_size
     started, logged, waited, saved = time.perf_counter(), trainer.steps_done, 0.0, False
-    told = -TELL_S
+    reported = -REPORT_S
     if rank == 0:
         print(f"{run.name}: {world} worker{'s' * (world != 1)}, from step {trainer.steps_done}", flush=True)
     feed = measure_waiting(iterate_batches(run.stream, run.reader, trainer.steps_done, run.settings.steps, rank, world))
@@ -115,9 +115,9 @@ def train_worker(run: TrainingRun) -> None:
         if is_memory_full:  # Here, the error no longer keeps the tensors of the failed step in memory.
             raise ValueError(describe_fitting_batch(trainer, batch, positions, world))
         step, last = trainer.steps_done, trainer.steps_done == run.settings.steps
-        if rank == 0 and (last or time.perf_counter() - told > TELL_S):
+        if rank == 0 and (last or time.perf_counter() - reported > REPORT_S):
             write_step(run, step)
-            told = time.perf_counter()
+            reported = time.perf_counter()
         is_late = time.perf_counter() - started > LINE_S
         if rank == 0 and (step % run.log_every == 0 or last or is_late):
             elapsed, done = time.perf_counter() - started, step - logged
@@ -134,9 +134,9 @@ def train_worker(run: TrainingRun) -> None:
                 flush=True,
             )
             started, logged, waited = time.perf_counter(), step, 0.0
-        is_lost = step % run.log_every == 0 and not saved and ray.train.get_preemption_info() is not None
-        if step % run.checkpoint_every == 0 or last or is_lost:  # A node will be taken away: save the steps until now.
-            saved = is_lost
+        is_preempted = step % run.log_every == 0 and not saved and ray.train.get_preemption_info() is not None
+        if step % run.checkpoint_every == 0 or last or is_preempted:  # The node will be preempted.
+            saved = is_preempted
             report(run, trainer, rank, float(losses["loss"]))
             started, logged, waited = time.perf_counter(), step, 0.0
 
@@ -170,12 +170,12 @@ def describe_fitting_batch(trainer: Trainer, batch: dict[str, np.ndarray], posit
 
 
 def write_step(run: TrainingRun, step: int) -> None:
-    """Tell the driver the number of finished steps."""
+    """Report the number of finished steps to the driver."""
     _internal_kv_put(f"pritti-step-{run.tracker.run_id}", str(step), overwrite=True)
 
 
 def read_step(run: TrainingRun) -> int:
-    """Return the number of finished steps that a worker has told, or 0."""
+    """Return the number of finished steps that a worker has reported, or 0."""
     return int(_internal_kv_get(f"pritti-step-{run.tracker.run_id}") or 0)
 
 
@@ -283,7 +283,7 @@ def fit(run: TrainingRun, num_workers: int, output: str, min_workers: int | None
 
 
 def fit_with_retries(run: TrainingRun, scaling: ScalingConfig) -> ray.train.Result:
-    """Run Ray Train; after RETRIES failures, continue if there is a new checkpoint since the first of them.
+    """Run Ray Train; after more than RETRIES failures, continue if there is a new checkpoint since the first of them.
 
     If the process that controls the workers dies, the training starts again from its last checkpoint.
 

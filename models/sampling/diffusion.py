@@ -313,7 +313,7 @@ def scale_noise(model: Denoiser, noise_scaling: float) -> Denoiser:
 
 @dataclass(frozen=True, eq=False)
 class InpaintCondition:
-    """Known part of latents (paper, Eqs. "z_known" ff.).
+    """Known part of latents (paper, supplement, Eq. 20 to 22).
 
     Attributes:
         latent: Clean latents of the known part.

@@ -1,6 +1,6 @@
 """Accuracy of decoded primitives, measured on pairs of a true primitive and a proposal.
 
-AP3D stays near zero as long as proposals lie metres from the primitives. These scores also change in that range, so
+AP3D remains near zero as long as proposals lie metres from the primitives. These scores also change in that range, so
 they show whether a decoder learns at all.
 """
 
@@ -19,7 +19,7 @@ from models.tensors import EXISTENCE_THRESHOLD
 from models.vae.matching import MatchWeights, match_primitives
 from models.vae.outputs import LayoutOutput
 
-NEAR_M = 1.0  # Largest distance of the centres of a primitive that counts as found (m).
+NEAR_M = 1.0  # Maximum centre distance of a detected primitive (m).
 
 
 @dataclass(frozen=True)
@@ -29,21 +29,21 @@ class PrimitivePairs:
     Attributes:
         distance_m: (p,) distance of the centres (m).
         iou3d: (p,) IoU3D.
-        likely: (p,) bool, True if the existence probability of the proposal exceeds the existence threshold.
-        num_likely: Number of proposals whose existence probability exceeds the threshold, with or without a partner.
+        above_threshold: (p,) bool, True if the existence probability of the proposal exceeds the existence threshold.
+        num_above_threshold: Number of all proposals whose existence probability exceeds the threshold.
     """
 
     distance_m: np.ndarray
     iou3d: np.ndarray
-    likely: np.ndarray
-    num_likely: int
+    above_threshold: np.ndarray
+    num_above_threshold: int
 
 
 def pair_primitives(output: LayoutOutput, batch: LayoutBatch, spec: LayoutSpec) -> PrimitivePairs:
     """Match true primitives with proposals.
 
     The matching is one to one within a category. It minimises the paper's matching cost without the term of existence,
-    that is the distances of the normalised centres and Cholesky parameters, whatever unit the model was trained with.
+    that is, the distances of the normalised centres and Cholesky parameters, regardless of the unit in training.
 
     Args:
         output: Decoded scenes.
@@ -69,12 +69,12 @@ def pair_primitives(output: LayoutOutput, batch: LayoutBatch, spec: LayoutSpec) 
         values = features.double().cpu().numpy()
         center_m = spec.center_bounds_m.restore(values[:, :3])
         boxes.append(make_boxes(center_m, *decode_cholesky_boxes(spec.cholesky_bounds.restore(values[:, 3:]))))
-    likely = output.existence_logit.sigmoid() > EXISTENCE_THRESHOLD
+    above_threshold = output.existence_logit.sigmoid() > EXISTENCE_THRESHOLD
     return PrimitivePairs(
         np.linalg.norm(boxes[0].center_m - boxes[1].center_m, axis=1),
         compute_iou3d_pairs(*boxes),
-        likely[sample, proposal].cpu().numpy(),
-        int(likely.sum()),
+        above_threshold[sample, proposal].cpu().numpy(),
+        int(above_threshold.sum()),
     )
 
 
@@ -87,8 +87,9 @@ def join_pairs(parts: Sequence[PrimitivePairs]) -> PrimitivePairs:
     Returns:
         Pairs of all batches.
     """
-    joined = (np.concatenate([getattr(part, name) for part in parts]) for name in ("distance_m", "iou3d", "likely"))
-    return PrimitivePairs(*joined, num_likely=sum(part.num_likely for part in parts))
+    names = ("distance_m", "iou3d", "above_threshold")
+    joined = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+    return PrimitivePairs(*joined, num_above_threshold=sum(part.num_above_threshold for part in parts))
 
 
 @dataclass(frozen=True)
@@ -97,14 +98,15 @@ class Accuracy:
 
     Attributes:
         median_center_error_m: Median distance of the centres (m).
-        found_1m: Share of the true primitives whose partner is likely and lies within NEAR_M.
-        right_1m: Share of the likely proposals that are such partners; 0 if no proposal is likely.
+        recall_1m: Share of the true primitives that are detected: the matched proposal is above the existence
+            threshold, and its centre lies within NEAR_M.
+        precision_1m: Share of the proposals above the threshold that detect a primitive; 0 without such proposals.
         mean_iou3d: Mean IoU3D.
     """
 
     median_center_error_m: float
-    found_1m: float
-    right_1m: float
+    recall_1m: float
+    precision_1m: float
     mean_iou3d: float
 
 
@@ -119,10 +121,10 @@ def compute_accuracy(pairs: PrimitivePairs) -> Accuracy:
     """
     if len(pairs.distance_m) == 0:
         return Accuracy(*[float("nan")] * 4)
-    near = (pairs.distance_m < NEAR_M) & pairs.likely
+    detected = (pairs.distance_m < NEAR_M) & pairs.above_threshold
     return Accuracy(
         float(np.median(pairs.distance_m)),
-        float(near.mean()),
-        float(near.sum() / max(pairs.num_likely, 1)),
+        float(detected.mean()),
+        float(detected.sum() / max(pairs.num_above_threshold, 1)),
         float(pairs.iou3d.mean()),
     )

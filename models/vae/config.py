@@ -83,7 +83,7 @@ class ObjectConfig:
         decoder: "detr", as in the paper, or "cells" (models/vae/cell_decoder.py).
         min_proposals_per_cell: Minimum number of proposals per category and cell (only for the decoder "cells").
         loss_unit: Unit of distances in matching and losses: "normalised" coordinates, as in the paper, "metres" or
-            "cells" of the latent grid. The Cholesky parameters have the square root of this unit.
+            "cells" of the latent grid. With metres and cells, the unit of Cholesky parameters is the square root of it.
         queries: Only for the decoder "detr", as are the following options: "learned" embeddings, as in the paper,
             "anchors" or "conditional" (models/vae/detr_decoder.py).
         learned_content: If True, the contents of queries start from learned values instead of zeros.

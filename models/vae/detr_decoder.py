@@ -1,8 +1,8 @@
 """Object decoder of the paper: a DETR transformer predicts primitives from the latent (paper, supplement B.2).
 
-With the default options, the decoder is DETR (Carion et al., ECCV 2020) without dropout, as in the paper. Auxiliary
-losses and a normalisation after the last layer, which DETR also has, are not mentioned in the paper and are off. The
-other options of `ObjectConfig` are changes from the literature that were proposed to speed up training:
+With the default options, the decoder is DETR (Carion et al., ECCV 2020) without dropout, as in the paper. The paper
+mentions neither DETR's auxiliary losses (off by default) nor its normalisation after the last layer (not implemented).
+These options of `ObjectConfig` are changes from the literature that were proposed to speed up training:
 
 * `queries="anchors"`: each query has a learned reference point, as in Anchor DETR (Wang et al., AAAI 2022). The
   position embedding of a query is a function of its point. A layer predicts offsets from the points, and the next layer
@@ -49,14 +49,14 @@ def embed_positions(
         row_col: Row and column in latent cells. The middle of the first cell is at 0.5.
         size: Number of rows and of columns of the latent grid.
         width: Number of channels. One half encodes the row, the other half the column.
-        unit: "map": wavelengths from one to 10,000 grids, as in the published settings of DETR. "cell": wavelengths
-            from 2 pi cells to 20 times as much, so that neighbouring cells differ. The ratio is that of DAB-DETR (Liu
-            et al., ICLR 2022).
+        unit: "map": wavelengths from 1 to 10,000 times the side of the grid, as in the settings of DETR. "cell":
+            wavelengths from 2 pi cells to 20 times as much, so that neighbouring cells differ. The ratio is that of
+            DAB-DETR (Liu et al., ICLR 2022).
 
     Returns:
         Position embeddings.
     """
-    position = row_col + 0.5
+    position = row_col + 0.5  # DETR counts cells from 1.
     if unit == "map":
         position = position / size * 2 * torch.pi
     wavelength = WAVELENGTH_RATIO[unit] ** (
@@ -270,6 +270,7 @@ class DETRDecoder(nn.Module):
         positions = cast(Tensor, self.positions)
         for k, layer in enumerate(self.layers):
             if anchors is not None:
+                # x points ahead and y to the left; row 0 lies farthest ahead and column 0 farthest left.
                 row_col = (1 - anchors[..., :2].sigmoid()) * self.latent_size
                 sine = embed_positions(row_col, self.latent_size, self.width, self.unit)
                 place = self.embed_anchor(sine)

@@ -16,7 +16,7 @@ from models.vae.outputs import LayoutOutput, Posterior, Prediction
 
 OCCUPANCY_WEIGHT, HEIGHT_WEIGHT, KL_WEIGHT = 1.0, 9.0, 1e-6
 
-# Weights of the losses of existence, centre and Cholesky parameters (paper, supplement Tab. "object loss weights").
+# Weights of the losses of existence, centre and Cholesky parameters (paper, supplement B.2).
 LOW, MEDIUM, HIGH = (1.0, 3.0, 2.0), (3.0, 9.0, 7.0), (5.0, 15.0, 12.0)
 OBJECT_WEIGHTS = {
     "vehicle_big": LOW,
@@ -104,7 +104,7 @@ def compute_object_losses(
     spec: LayoutSpec,
     proposals: tuple[int, ...],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the weighted existence, centre and Cholesky losses (supplement Eqs. "match", "line").
+    """Compute the weighted existence, centre and Cholesky losses (supplement, Eq. 7 and 8).
 
     For each category c, each loss is summed over the proposals and divided by max(n_c, 1), where n_c is the number of
     primitives of category c. The results are then summed over categories and averaged over the batch.

@@ -1,4 +1,4 @@
-"""Bipartite matching of proposals and true primitives per category (paper, supplement Eqs. "permutation", "match").
+"""Bipartite matching of proposals and true primitives per category (paper, supplement, Eq. 6 and 7).
 
 The paper assigns proposals to the padded list of primitives. This module assigns proposals only to real primitives,
 with the same result. In the paper, each proposal j that is assigned to a padded slot costs 6 BCE(0, p_j). If proposal j
@@ -126,10 +126,10 @@ def match_primitives(
                 rows, cols = linear_sum_assignment(cost)
                 assignment[sample, first_proposal[k] + cols] = first_slot[k] + rows
 
-    deque(_count_threads(torch.get_num_threads()).map(solve, range(len(assignment))), maxlen=0)
+    deque(_get_thread_pool(torch.get_num_threads()).map(solve, range(len(assignment))), maxlen=0)
     return torch.from_numpy(assignment).to(real.device)
 
 
 @cache
-def _count_threads(count: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(count, thread_name_prefix="matching")
+def _get_thread_pool(num_threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(num_threads, thread_name_prefix="matching")

@@ -1,8 +1,9 @@
-"""Run the paper's ablations as Ray graphs, and build their tables and charts.
+"""Ablation studies as Ray graphs, with tables and charts.
 
-There are three studies. `reconstruct_boxes` compares the encodings of a box. `compute_yaw_losses` measures the loss of
-IoU3D that yaw errors cause. The two studies of boxes use random boxes and read no dataset. The variants compare
-branches of the layout VAE.
+Two studies of boxes use random boxes and read no dataset: `reconstruct_boxes` compares the encodings of a box, and
+`compute_yaw_losses` measures the loss of IoU3D that yaw errors cause. Dictionaries of `Variant` describe the studies of
+the layout VAE: its branches and the encodings are ablations of the paper; decoders, changes of DETR, sizes of the
+ground branch, and augmentations are not.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class Trial:
         encoding: Encoding of a box.
         count: Number of training boxes.
         seed: Seed of boxes and weights.
-        numbers: Numbers that the autoencoder regresses. If "all", all numbers. If "moving", only the numbers that vary
+        numbers: Numbers that the autoencoder regresses. If "all", all numbers. If "varying", only the numbers that vary
             between boxes.
     """
 
@@ -100,8 +101,9 @@ def run_trial(trial: Trial, directory: str, settings: StudyConfig, test_count: i
     """Train one trial, score it on the shared test set and write DIRECTORY/<name>.json."""
     torch.set_num_threads(1)
     started = time.perf_counter()
-    moving_only = trial.numbers == "moving"
-    fitted = train_autoencoder(ENCODINGS[trial.encoding], draw_training_boxes(trial), settings, trial.seed, moving_only)
+    varying_only = trial.numbers == "varying"
+    boxes = draw_training_boxes(trial)
+    fitted = train_autoencoder(ENCODINGS[trial.encoding], boxes, settings, trial.seed, varying_only)
     seconds = time.perf_counter() - started
     truth = draw_boxes(BOX_DISTRIBUTIONS[trial.kind], test_count, TEST_KEY)
     rebuilt, error = fitted.rebuild(truth)
@@ -275,7 +277,7 @@ class Variant:
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
-BRANCHES = {
+BRANCH_VARIANTS = {
     "full model": Variant(),
     "without latent split": Variant({"split_latent": False}),
     "without objects": Variant({"branches": "ground"}),
@@ -283,7 +285,7 @@ BRANCHES = {
 }
 # Both decoders use the same branches, latents and unit of the losses (cells). The paper's DETR decoder diverges at the
 # learning rate of the cell decoder.
-DECODERS = {
+DECODER_VARIANTS = {
     "cells": Variant({"objects": {"decoder": "cells"}}),
     "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
     "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
@@ -298,7 +300,7 @@ COMBINED = {
 }
 # Changes of the DETR decoder or of its training: each alone, and four of them combined. The models have only the object
 # branch: with the latent split, the branches share no weights and no losses.
-DETR_CHANGES = {
+_DETR_CHANGES = {
     "baseline": Variant(),
     "loss in metres": Variant({"objects": {"loss_unit": "metres"}}),
     "loss in cells": Variant({"objects": {"loss_unit": "cells"}}),
@@ -315,20 +317,20 @@ DETR_CHANGES = {
     "random start": Variant(options={"init_from_data": False}),
     "combined": Variant(COMBINED),
 }
-DETR_CHANGES = {
+DETR_VARIANTS = {
     name: Variant({"branches": "objects"} | dict(change.architecture), change.options)
-    for name, change in DETR_CHANGES.items()
+    for name, change in _DETR_CHANGES.items()
 }
 # Variants with only the ground branch. The preset `town` has the options `pixel_unshuffle=8` and `channels=(32,)`.
 # With the option `shortcut`, the initial weights are a linear map from a principal component analysis of the data
 # (models/vae/ground.py).
-GROUND = {
+GROUND_VARIANTS = {
     name: Variant({"branches": "ground"} | changes)
     for name, changes in {
         "as the preset": {},
         "without the linear start": {"shortcut": False},
         "half as wide": {"ground": {"channels": (16,)}},
-        "one level more, folded by 4": {"ground": {"channels": (32, 32), "pixel_unshuffle": 4}},
+        "one more level, pixel unshuffle 4": {"ground": {"channels": (32, 32), "pixel_unshuffle": 4}},
         "an eighth of the paper's widths": {
             "ground": {"channels": (8, 16, 32, 64), "pixel_unshuffle": 1, "attention": True}
         },
@@ -338,7 +340,7 @@ GROUND = {
         },
     }.items()
 }
-AUGMENTATIONS = {
+AUGMENTATION_VARIANTS = {
     "scenes as they are": Variant(),
     "mirrored": Variant(options={"flip": True}),
     "moved": Variant(options={"jitter": True}),
@@ -346,8 +348,8 @@ AUGMENTATIONS = {
 }
 MEASURES = {"ground_iou": "ground", "height_mse_normalised": "ground", "height_rmse_m": "ground"}
 ACCURACY_SCENES = 128  # The driver holds these scenes in memory.
-OF_PRIMITIVES = ("ap3d", "ap3d_50", "found_1m", "median_center_error_m", "control_center_error_m")
-MEASURES |= dict.fromkeys(OF_PRIMITIVES, "objects")
+OBJECT_MEASURES = ("ap3d", "ap3d_50", "recall_1m", "median_center_error_m", "control_center_error_m")
+MEASURES |= dict.fromkeys(OBJECT_MEASURES, "objects")
 
 
 def select_measures(variant: Variant, scores: Mapping[str, float]) -> dict[str, float | None]:
@@ -372,7 +374,8 @@ def measure_accuracy(model: LayoutVAE, selection: SceneSubset, batch_size: int =
 
     Returns:
         The scores of `Accuracy` by name, and `control_center_error_m`: the median centre error if each scene is
-        decoded from the latent of another selected scene. A decoder that ignores the latent has equal errors.
+        decoded from the latent of another selected scene. A decoder that ignores the latent has the same error with
+        both latents.
     """
     few = replace(selection, limit=min(selection.limit or ACCURACY_SCENES, ACCURACY_SCENES))
     scenes = [scene for shard, rows in few.shards() for scene in shard.scenes(rows)]
@@ -464,7 +467,7 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
         "height_rmse_m": "height RMSE, cm",
         "ap3d": "AP3D, %",
         "ap3d_50": "AP3D@50, %",
-        "found_1m": "found within 1 m, %",
+        "recall_1m": "recall within 1 m, %",
     }
     names = {name: text for name, text in names.items() if any(row[f"{name}_mean"] is not None for row in rows)}
     columns = ["variant", "parameters", "GFLOP", "seeds", "steps", "minutes", *names.values()]
@@ -485,10 +488,11 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
         cells.append(cell)
     note = (
         "Scores are given as mean (minimum to maximum) over seeds. Scenes are reconstructed from the latent mean. "
-        "GFLOP is the cost to encode and decode one scene. Found: the matched proposal exists and lies within 1 m. The "
-        "centre error is the median distance between a primitive and its matched proposal, whether this exists or not. "
-        "The control decodes each scene from the latent of another scene. A decoder that ignores the latent has the "
-        "same error there."
+        "GFLOP is the cost to encode and decode one scene. Minutes are those of the training with start-up and "
+        "validation. Recall: the share of primitives whose matched proposal has an existence probability above the "
+        "threshold and lies within 1 m. The centre error is the median distance between a primitive and its matched "
+        "proposal of any existence probability. The control decodes each scene from the latent of another scene. A "
+        "decoder that ignores the latent has the same error with both latents."
     )
     return Table("Variants of the layout VAE", columns, cells, note=note)
 

@@ -12,10 +12,10 @@ import torch
 from models.presets import LVAE_PRESETS
 from models.vae.config import LayoutVAEConfig, override_options
 from pipelines.evaluation.ablation import (
-    AUGMENTATIONS,
-    BRANCHES,
-    DECODERS,
-    DETR_CHANGES,
+    AUGMENTATION_VARIANTS,
+    BRANCH_VARIANTS,
+    DECODER_VARIANTS,
+    DETR_VARIANTS,
     select_measures,
 )
 
@@ -73,10 +73,10 @@ def test_variant_differs_from_preset_only_in_its_switch(empty_home):
     from pipelines.training.data_loader import read_samples
 
     for config, variant, switch in (
-        *((Branches(preset="smoke"), *item) for item in BRANCHES.items()),
-        *((Decoders(preset="smoke"), *item) for item in DECODERS.items()),
-        *((Augmentation(preset="smoke"), *item) for item in AUGMENTATIONS.items()),
-        *((Detr(preset="smoke"), *item) for item in DETR_CHANGES.items()),
+        *((Branches(preset="smoke"), *item) for item in BRANCH_VARIANTS.items()),
+        *((Decoders(preset="smoke"), *item) for item in DECODER_VARIANTS.items()),
+        *((Augmentation(preset="smoke"), *item) for item in AUGMENTATION_VARIANTS.items()),
+        *((Detr(preset="smoke"), *item) for item in DETR_VARIANTS.items()),
     ):
         run = prepare_variant(config, variant, f"test-{variant}", seed=1, steps=3)
         trainer = run.build(torch.device("cpu"), lambda model: model)
@@ -102,16 +102,16 @@ def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys)
         scores = {"ground_iou": 0.9 + 0.01 * seed, "height_mse_normalised": 1e-4, "height_rmse_m": 0.1}
         described = {"variant": variant, "seed": seed, "steps": config.steps, "dataset": "DIR", "parameters": 1}
         described |= {"gflops": 0.5}
-        scores |= {"ap3d": 0.5, "ap3d_50": 0.25, "found_1m": 0.6}
+        scores |= {"ap3d": 0.5, "ap3d_50": 0.25, "recall_1m": 0.6}
         scores |= {"median_center_error_m": 0.4, "control_center_error_m": 5.0}
         described |= {"training_seconds": 1.0, "curve": [(2, 0.1), (7, 0.5)]}
-        return described | select_measures(BRANCHES[variant], scores)
+        return described | select_measures(BRANCH_VARIANTS[variant], scores)
 
     monkeypatch.setattr(job, "train_variant", train_variant)
     output = job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=2))
-    assert trained == [(seed, variant) for seed in (0, 1) for variant in BRANCHES]
+    assert trained == [(seed, variant) for seed in (0, 1) for variant in BRANCH_VARIANTS]
     job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=3))
-    assert trained[8:] == [(2, variant) for variant in BRANCHES]
+    assert trained[8:] == [(2, variant) for variant in BRANCH_VARIANTS]
     job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=4, only_variants=("without ground",)))
     assert trained[12:] == [(3, "without ground")]
     job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=3))

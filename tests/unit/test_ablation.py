@@ -29,10 +29,11 @@ from models.vae.losses import compute_lvae_loss
 from models.vae.matching import MatchWeights
 from models.vae.outputs import LayoutOutput
 from pipelines.evaluation.ablation import (
-    AUGMENTATIONS,
-    BRANCHES,
-    DECODERS,
-    GROUND,
+    AUGMENTATION_VARIANTS,
+    BRANCH_VARIANTS,
+    DECODER_VARIANTS,
+    DETR_VARIANTS,
+    GROUND_VARIANTS,
     LOST_YAW_IOU3D,
     CenteredBoxes,
     Trial,
@@ -282,12 +283,12 @@ def test_ground_study_shrinks_networks_at_equal_latents():
     row = LVAE_PRESETS["town"].architecture()
     models = {
         name: LayoutVAE(layout=LayoutSpec().to_dict(), **override_options(row, variant.architecture))
-        for name, variant in GROUND.items()
+        for name, variant in GROUND_VARIANTS.items()
     }
     assert {model.latent_shape for model in models.values()} == {(32, 32, 32)}
     sizes = {name: model.num_parameters() for name, model in models.items()}
     paper = LVAE_PRESETS["kitti360"]
-    assert GROUND["the paper's networks"].architecture["ground"]["channels"] == paper.model.ground.channels
+    assert GROUND_VARIANTS["the paper's networks"].architecture["ground"]["channels"] == paper.model.ground.channels
     assert min(sizes, key=sizes.get) in ("half as wide", "an eighth of the paper's widths")
     assert max(sizes, key=sizes.get) == "the paper's networks"
 
@@ -295,8 +296,9 @@ def test_ground_study_shrinks_networks_at_equal_latents():
 def test_variant_names_are_valid_for_files_and_mlflow():
     from jobs.implementation.ablate_lvae import make_slug
 
-    names = [make_slug(name) for study in (BRANCHES, DECODERS, GROUND, AUGMENTATIONS) for name in study]
-    assert all(re.fullmatch(r"[\w-]+", name) for name in names) and len(set(names)) == len(names) > 12
+    studies = (BRANCH_VARIANTS, DECODER_VARIANTS, DETR_VARIANTS, GROUND_VARIANTS, AUGMENTATION_VARIANTS)
+    names = [make_slug(name) for study in studies for name in study]
+    assert all(re.fullmatch(r"[\w-]+", name) for name in names) and len(set(names)) == len(names) > 27
 
 
 def test_study_without_trials_releases_its_directory(tmp_path):
@@ -330,7 +332,7 @@ def test_decoder_that_ignores_latents_is_as_wrong_as_the_control(tmp_path):
 
     perfect = SimpleNamespace(spec=spec, encode=encode, decode=decode)
     scores = measure_accuracy(perfect, selection, batch_size=3)
-    assert scores["median_center_error_m"] < 0.01 and scores["found_1m"] == 1
+    assert scores["median_center_error_m"] < 0.01 and scores["recall_1m"] == 1
     assert scores["control_center_error_m"] > 2
     constant = encode(first).mean
     blind = SimpleNamespace(spec=spec, encode=encode, decode=lambda z: decode(constant.expand(len(z), -1, -1)))

@@ -81,7 +81,7 @@ def test_scenes_travel_without_loss_and_are_small(tmp_path):
 
 def test_scenes_that_are_too_large_are_not_written(tmp_path, monkeypatch):
     monkeypatch.setattr(gpu, "MAX_SCENES_BYTES", 1000)
-    with pytest.raises(ValueError, match=r"2 scenes need .* bytes, at most 1,000 travel; use --num-scenes"):
+    with pytest.raises(ValueError, match=r"2 scenes need .* bytes, more than 1,000; lower --num-scenes; use --num-scenes"):
         gpu.write_scenes(tmp_path / "town.safetensors", 2)
     assert not list(tmp_path.iterdir())
 
@@ -135,8 +135,8 @@ def test_primitives_of_a_perfect_decoder_are_all_found():
     measured = list(gpu.measure_primitives(model, arrays).values())
     assert np.allclose(measured, [0, 100, 100, 100], atol=0.1)
     offset_m[0] = 2
-    error_m, found, right, _ = gpu.measure_primitives(model, arrays).values()
-    assert 1 < error_m <= 2.01 and found < 60 and right < 60
+    error_m, recall, precision, _ = gpu.measure_primitives(model, arrays).values()
+    assert 1 < error_m <= 2.01 and recall < 60 and precision < 60
 
 
 def test_scenes_of_a_file_are_held_out(tmp_path):

@@ -11,7 +11,7 @@ import tyro
 from helpers import ROOT
 
 from jobs.implementation.paper_plan import Counts, count_poses, find_presets, make_plan
-from jobs.implementation.reproduce_paper import check_weights, require_space
+from jobs.implementation.reproduce_paper import check_options, require_space
 from jobs.reproduce_paper import Av2, Kitti360
 from models.presets import DIT_PRESETS, LVAE_PRESETS
 from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
@@ -97,11 +97,11 @@ def test_missing_parts_of_datasets_are_found_first(tmp_path):
 
 def test_impossible_options_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"--inception /nowhere/w\.pth does not exist"):
-        check_weights(Kitti360("/data", inception="/nowhere/w.pth"))
+        check_options(Kitti360("/data", inception="/nowhere/w.pth"))
     with pytest.raises(ValueError, match="on Argoverse 2, the paper has only DiT-B"):
-        check_weights(Av2("/data", transformers=("b", "xl")))
+        check_options(Av2("/data", transformers=("b", "xl")))
     with pytest.raises(ValueError, match="expected different sizes"):
-        check_weights(Kitti360("/data", transformers=("b", "b")))
+        check_options(Kitti360("/data", transformers=("b", "b")))
     huge = [replace(stage, gigabytes=1e9) for stage in make_plan(PLANS[0], FULL)]
     with pytest.raises(ValueError, match="choose another --output"):
         require_space(huge, str(tmp_path / "new"))
