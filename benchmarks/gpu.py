@@ -117,26 +117,26 @@ class Setup:
         return tiny if self.tiny else full
 
     def dit_preset(self, name: str) -> DiTPreset:
-        row = DIT_PRESETS[name]
-        return replace(row, model=DiTConfig(2, 2, 32, 2)) if self.tiny else row
+        preset = DIT_PRESETS[name]
+        return replace(preset, model=DiTConfig(2, 2, 32, 2)) if self.tiny else preset
 
     def lvae_preset(self, name: str) -> LVAEPreset:
         return LVAE_PRESETS["smoke" if self.tiny else name]
 
-    def spec(self, row: LVAEPreset) -> LayoutSpec:
-        return LayoutSpec().with_resolution(row.raster_px)
+    def spec(self, preset: LVAEPreset) -> LayoutSpec:
+        return LayoutSpec().with_resolution(preset.raster_px)
 
     def make_lvae(self, name: str) -> LayoutVAE:
-        row = self.lvae_preset(name)
+        preset = self.lvae_preset(name)
         torch.manual_seed(0)
-        return LayoutVAE(layout=self.spec(row).to_dict(), **row.architecture())
+        return LayoutVAE(layout=self.spec(preset).to_dict(), **preset.architecture())
 
     def make_pipeline(self, name: str) -> PrITTIPipeline:
         """Return a pipeline with random weights on the device; the encoders remain on the CPU."""
-        row = self.dit_preset(name)
-        lvae = self.make_lvae(row.lvae)
+        preset = self.dit_preset(name)
+        lvae = self.make_lvae(preset.lvae)
         channels, size, _ = lvae.latent_shape
-        dit = DiT(**row.architecture(), channels=channels, size=size, layout=dict(lvae.config.layout))
+        dit = DiT(**preset.architecture(), channels=channels, size=size, layout=dict(lvae.config.layout))
         for layer in (*dit.list_modulations(), dit.patch_out):  # They are zero at the start of a training.
             torch.nn.init.normal_(layer.weight, std=0.02)
         pipeline = PrITTIPipeline(lvae, dit)
@@ -358,24 +358,26 @@ def draw_posteriors(trainer: Trainer, batch: int, seed: int = 0) -> dict[str, to
 
 
 def make_dit_for_training(setup: Setup, precision: str, compiled: bool = False) -> Trainer:
-    row, shape = setup.dit_preset("kitti360"), setup.make_lvae("kitti360").latent_shape
+    preset, shape = setup.dit_preset("kitti360"), setup.make_lvae("kitti360").latent_shape
     torch.manual_seed(0)
-    dit = DiT(**row.architecture(), channels=shape[0], size=shape[1])
+    dit = DiT(**preset.architecture(), channels=shape[0], size=shape[1])
     settings = OptimizerConfig(
-        row.steps, row.learning_rate, row.weight_decay, grad_clip=row.grad_clip, ema_decay=row.ema_decay
+        preset.steps, preset.learning_rate, preset.weight_decay, grad_clip=preset.grad_clip, ema_decay=preset.ema_decay
     )
     execution = ExecutionConfig(precision=precision, compile=compiled)
-    return make_dit_trainer(dit, settings, row.label_dropout, setup.device, execution=execution)
+    return make_dit_trainer(dit, settings, preset.label_dropout, setup.device, execution=execution)
 
 
 def make_lvae_for_training(setup: Setup, precision: str, steps: int = 0, batch: dict | None = None) -> Trainer:
-    row, lvae = setup.lvae_preset("kitti360"), setup.make_lvae("kitti360")
+    preset, lvae = setup.lvae_preset("kitti360"), setup.make_lvae("kitti360")
     lvae.to(setup.device)
-    if batch is not None and row.init_from_data:
+    if batch is not None and preset.init_from_data:
         lvae.init_from_data(LayoutBatch.from_compact(batch))
-    settings = OptimizerConfig(steps or row.steps, row.learning_rate, row.weight_decay, row.final_learning_rate)
+    settings = OptimizerConfig(
+        steps or preset.steps, preset.learning_rate, preset.weight_decay, preset.final_learning_rate
+    )
     return make_lvae_trainer(
-        lvae, settings, row.kl_weight, setup.device, execution=ExecutionConfig(precision=precision)
+        lvae, settings, preset.kl_weight, setup.device, execution=ExecutionConfig(precision=precision)
     )
 
 
@@ -513,8 +515,8 @@ def run_learn(setup: Setup) -> Iterator[Row]:
     """Train a layout VAE on the scenes for at most LEARN_SECONDS, from the last checkpoint."""
     if not setup.scenes and not setup.tiny:
         raise ValueError("learn needs --scenes FILE; make it with --write-scenes FILE")
-    row = setup.lvae_preset("kitti360")
-    layouts, steps, batch = Layouts(setup, setup.spec(row)), setup.choose(setup.steps, 4), setup.choose(32, 2)
+    preset = setup.lvae_preset("kitti360")
+    layouts, steps, batch = Layouts(setup, setup.spec(preset)), setup.choose(setup.steps, 4), setup.choose(32, 2)
     trainer = make_lvae_for_training(setup, "auto", steps, layouts.draw(0, min(64, len(layouts))))
     folder = setup.output / "learn"
     if (folder / "state.json").exists():
