@@ -290,16 +290,15 @@ DECODER_VARIANTS = {
     "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
     "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
 }
-COMBINED = {
-    "objects": {
-        "loss_unit": "metres",
-        "position_unit": "cell",
-        "queries": "conditional",
-        "auxiliary_losses": True,
-    }
+COMBINED: dict[str, object] = {
+    "loss_unit": "metres",
+    "position_unit": "cell",
+    "queries": "conditional",
+    "auxiliary_losses": True,
 }
-# Changes of the DETR decoder or of its training: each alone, and four of them combined. The models have only the object
-# branch: with the latent split, the branches share no weights and no losses.
+# Changes of the DETR decoder or of its training: each alone, four of them combined, and variants of the combination,
+# which lack one of the four changes or have another one. The models have only the object branch: with the latent split,
+# the branches share no weights and no losses.
 _DETR_CHANGES = {
     "baseline": Variant(),
     "loss in metres": Variant({"objects": {"loss_unit": "metres"}}),
@@ -307,7 +306,6 @@ _DETR_CHANGES = {
     "learning rate 2.5e-4": Variant(options={"learning_rate": 2.5e-4}),
     "learning rate 1e-3": Variant(options={"learning_rate": 1e-3}),
     "warm-up": Variant(options={"warmup_steps": 200}),
-    "clipped gradients": Variant(options={"grad_clip": 1.0}),
     "auxiliary losses": Variant({"objects": {"auxiliary_losses": True}}),
     "learned contents": Variant({"objects": {"learned_content": True}}),
     "positions per cell": Variant({"objects": {"position_unit": "cell"}}),
@@ -315,7 +313,13 @@ _DETR_CHANGES = {
     "conditional attention": Variant({"objects": {"queries": "conditional"}}),
     "denoising queries": Variant({"objects": {"denoising_groups": 1}}),
     "random start": Variant(options={"init_from_data": False}),
-    "combined": Variant(COMBINED),
+    "combined": Variant({"objects": COMBINED}),
+    "combined, normalised loss": Variant({"objects": COMBINED | {"loss_unit": "normalised"}}),
+    "combined, loss in cells": Variant({"objects": COMBINED | {"loss_unit": "cells"}}),
+    "combined, positions of the map": Variant({"objects": COMBINED | {"position_unit": "map"}}),
+    "combined, learned queries": Variant({"objects": COMBINED | {"queries": "learned"}}),
+    "combined, no auxiliary losses": Variant({"objects": COMBINED | {"auxiliary_losses": False}}),
+    "combined, learned contents": Variant({"objects": COMBINED | {"learned_content": True}}),
 }
 DETR_VARIANTS = {
     name: Variant({"branches": "objects"} | dict(change.architecture), change.options)
