@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Train and evaluate the paper's models, and write its tables with the paper's and the reproduced numbers.
+"""Train and evaluate the paper's models, and compare the results with the paper's tables.
 
     jobs/reproduce_paper.py kitti360 --input KITTI-360 --dry-run          the plan, with times and disk space
     jobs/reproduce_paper.py kitti360 --input KITTI-360 --num-workers 4 --inception FILE
