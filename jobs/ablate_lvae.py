@@ -107,7 +107,8 @@ class Decoders(Branches):
 class Detr(Branches):
     """Compare changes of the DETR decoder or its training, without the ground branch, for equal time.
 
-    Each change is made alone, four of them are combined, and variants of the combination lack one of the four.
+    Each change is made alone, four of them are combined, and variants of the combination lack one of them or have
+    another one.
     """
 
     preset: tyro.conf.Positional[str] = "kitti360-mini"

@@ -31,7 +31,7 @@ class PaperOptions:
     input: str
     """Root directory of the raw dataset."""
     scale: Literal["paper", "mini"] = "paper"
-    """Size of the networks and number of steps: as in the paper, or a rehearsal of about an hour on two cores."""
+    """Size of the networks and number of steps: as in the paper, or a rehearsal with small networks on two cores."""
     output: str = ""
     """Directory to write all files to: data, runs, models, tables, and MLflow's database if it is local (default:
     $PRITTI_HOME/paper-<dataset>)."""

@@ -31,9 +31,12 @@ EVALUATE_S = 0.64
 # Reported by the paper (supplement B.2 and B.3, Tab. 3): GPU hours on A100, and seconds per scene on one A100.
 PAPER_LVAE_GPU_H, PAPER_DIT_GPU_H, PAPER_SAMPLE_S = 72.0, 288.0, {"b": 0.58, "l": 1.78, "xl": 2.11}
 ENCODE_GPU_S = 0.01  # Assumed.
-# Guesses for two cores, not measured: seconds per step, and per scene with 250 denoising steps.
-MINI_LVAE_STEP_S, MINI_DIT_STEP_S, MINI_SAMPLE_S, MINI_ENCODE_S, RECONSTRUCT_S = 2.0, 0.15, 2.0, 0.1, 0.5
-MEASURED, GUESSED = "rates of benchmarks/cost_rates.py, two cores", "a guess for two cores, not measured"
+# Measured on two cores by a rehearsal of KITTI-360 at 4e9d2b7: seconds per step and per scene. The layout VAE needed
+# 2.2 s per step of batch 8; half of it is assumed for batch 4.
+MINI_LVAE_STEP_S, MINI_DIT_STEP_S, MINI_ENCODE_S, RECONSTRUCT_S = 1.1, 0.33, 0.06, 0.3
+MINI_SAMPLE_S = 2.0  # A guess: seconds per scene with 250 denoising steps.
+MEASURED, REHEARSED = "rates of benchmarks/cost_rates.py, two cores", "a rehearsal on two cores"
+GUESSED = "a guess for two cores, not measured"
 BYTES_PER_WEIGHT, KEPT_CHECKPOINTS = 20, 2  # Weights, EMA, two moments of AdamW and the model, in float32.
 WEIGHTS = {"lvae": 93.1e6, "b": 130e6, "l": 458e6, "xl": 675e6}
 MINI_WEIGHTS = 4e6
@@ -174,7 +177,7 @@ def _list_stages(config: PaperConfig, counts: Counts) -> Iterator[Stage]:
         LVAEConfig(preset, data, num_workers=workers, steps=chosen, seed=config.seed, **shared),
         steps * MINI_LVAE_STEP_S / 3600 if mini else share * PAPER_LVAE_GPU_H / workers,
         weights * BYTES_PER_WEIGHT * KEPT_CHECKPOINTS / 1e9,
-        GUESSED if mini else f"the paper's {PAPER_LVAE_GPU_H:g} GPU hours on A100",
+        REHEARSED if mini else f"the paper's {PAPER_LVAE_GPU_H:g} GPU hours on A100",
     )
     yield Stage(
         "encode latents",
@@ -182,7 +185,7 @@ def _list_stages(config: PaperConfig, counts: Counts) -> Iterator[Stage]:
         EncodeConfig(dataset=data, lvae=lvae, num_actors=workers, **shared),
         total * (MINI_ENCODE_S if mini else ENCODE_GPU_S) / workers / 3600,
         total * LATENT_BYTES / 1e9,
-        GUESSED if mini else "assumed",
+        REHEARSED if mini else "assumed",
     )
     yield Stage(
         "evaluate the reconstruction",
@@ -196,7 +199,7 @@ def _list_stages(config: PaperConfig, counts: Counts) -> Iterator[Stage]:
         ),
         counts.test * RECONSTRUCT_S / 3600,
         counts.test * 1e4 / 1e9,
-        GUESSED,
+        REHEARSED if mini else f"{REHEARSED}, with a smaller network",
     )
     if config.ablations:
         variants = ("without latent split", "without objects", "without ground")
@@ -206,7 +209,7 @@ def _list_stages(config: PaperConfig, counts: Counts) -> Iterator[Stage]:
             Branches(preset, data, steps=steps, num_seeds=1, only_variants=variants, num_workers=workers, **shared),
             3 * (steps * MINI_LVAE_STEP_S / 3600 if mini else share * PAPER_LVAE_GPU_H / workers),
             3 * weights * BYTES_PER_WEIGHT * KEPT_CHECKPOINTS / 1e9,
-            GUESSED if mini else f"the paper's {PAPER_LVAE_GPU_H:g} GPU hours on A100 per variant",
+            REHEARSED if mini else f"the paper's {PAPER_LVAE_GPU_H:g} GPU hours on A100 per variant",
         )
     for size in config.transformers:
         yield from _list_transformer_stages(config, counts, size, data, shared)
@@ -237,7 +240,7 @@ def _list_transformer_stages(
         ),
         steps * MINI_DIT_STEP_S / 3600 if mini else steps / full * PAPER_DIT_GPU_H / workers,
         weights * BYTES_PER_WEIGHT * KEPT_CHECKPOINTS / 1e9,
-        GUESSED if mini else f"the paper's {PAPER_DIT_GPU_H:g} GPU hours on A100",
+        REHEARSED if mini else f"the paper's {PAPER_DIT_GPU_H:g} GPU hours on A100",
     )
     per_scene = MINI_SAMPLE_S if mini else PAPER_SAMPLE_S[size]
     yield Stage(

@@ -2,8 +2,8 @@
 
 Two studies of boxes use random boxes and read no dataset: `reconstruct_boxes` compares the encodings of a box, and
 `compute_yaw_losses` measures the loss of IoU3D that yaw errors cause. Dictionaries of `Variant` describe the studies of
-the layout VAE: its branches and the encodings are ablations of the paper; decoders, changes of DETR, sizes of the
-ground branch, and augmentations are not.
+the layout VAE: branches, decoders, changes of DETR, sizes of the ground branch, and augmentations. The encodings and
+the branches are ablations of the paper.
 """
 
 from __future__ import annotations
