@@ -304,6 +304,7 @@ def test_write_whole_hides_unfinished_file_from_queries(tmp_path):
 # ------------------------------------------------------------------------------------------------------ full disks
 
 
+@pytest.mark.slow  # test_write_shard_names_failed_file_and_cleans_up limits the size of a file instead.
 def test_preprocess_reports_full_disk_and_resumes(town, tmp_path):
     """The full disk is a small tmpfs in a separate mount namespace."""
     full, left = tmp_path / "full", tmp_path / "left"

@@ -42,6 +42,7 @@ def weights(tmp_path_factory) -> str:
     return str(path)
 
 
+@pytest.mark.slow  # test_protocol_job.py scores images, and the test of the controls scores tables.
 def test_evaluate_scores_tables_and_their_images_equally(smoke, weights, tmp_path):
     """The test compares training scenes with test scenes twice: first from tables, then from ADM's .npz files of
     images."""

@@ -126,19 +126,14 @@ def test_sample_glb_has_named_node_per_primitive(samples):
         assert sum(node.startswith(category) for node in nodes) == (scene.label == category).sum()
 
 
-def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
-    from jobs.evaluate_scenes import Config
+def test_outpaint_keeps_the_scene_and_its_seams_are_scored(smoke, samples, tmp_path):
     from jobs.evaluate_seams import Config as SeamsConfig
-    from jobs.implementation.evaluate_scenes import evaluate
     from jobs.implementation.evaluate_seams import evaluate_seams
     from jobs.implementation.outpaint_scenes import outpaint
-    from jobs.implementation.sweep_seams import sweep_seams
     from jobs.outpaint_scenes import Config as OutpaintConfig
-    from jobs.sweep_seams import Config as SweepConfig
 
-    model = str(smoke / "models/pritti-smoke")
     options = OutpaintConfig(
-        model=model,
+        model=str(smoke / "models/pritti-smoke"),
         input=str(samples),
         source="generated-samples",
         output=str(tmp_path),
@@ -164,14 +159,20 @@ def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
     assert dict(duckdb.sql(query).fetchall())["seams.generated"] == seams["seams"]["generated"] > 0
     assert (tmp_path / "seams/seams.html").read_text().count("<img") > 0
 
+
+@pytest.mark.slow  # The test above scores the same seams for one setting.
+def test_sweep_seams_compares_settings_with_ceiling_and_control(smoke, samples, tmp_path):
+    from jobs.implementation.sweep_seams import sweep_seams
+    from jobs.sweep_seams import Config as SweepConfig
+
     row, guided, *as_paper, ceiling, control = sweep_seams(
         SweepConfig(
-            model=model,
+            model=str(smoke / "models/pritti-smoke"),
             input=str(samples),
             source="generated-samples",
             settings=((4, 2, 2, 0.0, 1.0), (4, 1, 1, 1.0, 0.0)),
             neighbour_latents=("reencode", "paper"),
-            real=real,
+            real=str(smoke / "datasets/smoke"),
             output=str(tmp_path / "sweep"),
         )
     )
@@ -183,9 +184,14 @@ def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
     assert found == [(6,), (4,)] * 2 + [(None,)] * 2
     assert (tmp_path / "sweep/sweep.html").read_text().count("<img") == 4
 
+
+def test_evaluate_scores_generated_scenes_and_reconstruction(smoke, samples, tmp_path):
+    from jobs.evaluate_scenes import Config
+    from jobs.implementation.evaluate_scenes import evaluate
+
     scores = evaluate(
         Config(
-            real=real,
+            real=str(smoke / "datasets/smoke"),
             generated=str(samples),
             lvae=str(smoke / "models/lvae-smoke"),
             num_examples=0,

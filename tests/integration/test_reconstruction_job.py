@@ -26,6 +26,7 @@ def reconstruction(reconstruction_dataset, cluster, tmp_path_factory) -> Reconst
     return evaluate_reconstruction(select_scenes(reconstruction_dataset), lvae, records)
 
 
+@pytest.mark.slow  # tests/integration/test_evaluate_job.py resumes the same tasks for features.
 def test_reconstruction_is_independent_of_chunks_and_workers(reconstruction_dataset, reconstruction, tmp_path):
     done: list[int] = []
 

@@ -94,6 +94,7 @@ def test_find_files_combines_arguments(tmp_path):
         find_files((f"{a}/1.glb", f"{a}/5.glb"), ".glb")
 
 
+@pytest.mark.slow  # Other tests import scenes and evaluate scenes.
 def test_evaluate_scores_imported_scenes(smoke, tmp_path):
     from jobs.evaluate_scenes import Config as EvaluateConfig
     from jobs.implementation.evaluate_scenes import evaluate
