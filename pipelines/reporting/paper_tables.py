@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from pipelines.metrics.two_sample import FOLDS, MIN_SCENES
 from pipelines.reporting.report import Cell, Table
 
 MIB = 2**20  # The paper's MB.
@@ -213,6 +214,8 @@ def find_score_of_limits(path: str) -> str:
 def _explain_missing(number: PaperNumber) -> str:
     if number.score.startswith("ablation."):
         return "needs --ablations"
+    if number.score == "two_sample_auc":
+        return f"needs {MIN_SCENES} scenes and {FOLDS} places per side"
     return "benchmarks/gpu.py measures it" if number.score == "seconds" else "not computed"
 
 

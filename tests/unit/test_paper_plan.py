@@ -149,7 +149,10 @@ def test_rows_without_weights_say_so():
     rows = compare_with_paper("av2", Reproduced({}, {"b": {"two_sample_auc": {"value": 0.6}}}, {}))
     found = {row["name"]: row for row in rows}
     assert found["FID, DiT-B"]["note"] == "needs --inception FILE"
-    assert found["AUC of a classifier, 0.5 is perfect, DiT-B"]["ours"] == 0.6
+    name = "AUC of a classifier, 0.5 is perfect, DiT-B"
+    assert found[name]["ours"] == 0.6
+    rows = compare_with_paper("av2", Reproduced({}, {"b": {"relation_frechet": {"value": 9.0}}}, {}))
+    assert {row["name"]: row for row in rows}[name]["note"] == "needs 10 scenes and 5 places per side"
 
 
 def test_scores_are_found_by_path():
