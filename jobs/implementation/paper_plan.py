@@ -34,9 +34,9 @@ ENCODE_GPU_S = 0.01  # Assumed.
 # Measured on two cores by a rehearsal of KITTI-360 at 4e9d2b7: seconds per step and per scene. The layout VAE needed
 # 2.2 s per step of batch 8; half of it is assumed for batch 4.
 MINI_LVAE_STEP_S, MINI_DIT_STEP_S, MINI_ENCODE_S, RECONSTRUCT_S = 1.1, 0.33, 0.06, 0.3
-MINI_SAMPLE_S = 2.0  # A guess: seconds per scene with 250 denoising steps.
+MINI_SAMPLE_S = 3.8  # Seconds per scene with 250 denoising steps, by a rehearsal on one core at 4c3aadf.
 MEASURED, REHEARSED = "rates of benchmarks/cost_rates.py, two cores", "a rehearsal on two cores"
-GUESSED = "a guess for two cores, not measured"
+REHEARSED_ON_ONE_CORE = "a rehearsal on one core"
 BYTES_PER_WEIGHT, KEPT_CHECKPOINTS = 20, 2  # Weights, EMA, two moments of AdamW and the model, in float32.
 WEIGHTS = {"lvae": 93.1e6, "b": 130e6, "l": 458e6, "xl": 675e6}
 MINI_WEIGHTS = 4e6
@@ -258,7 +258,7 @@ def _list_transformer_stages(
         ),
         scenes * per_scene * config.num_inference_steps / 250 / workers / 3600,
         scenes * GENERATED_BYTES / 1e9,
-        GUESSED if mini else f"the paper's {per_scene:g} s per scene on one A100",
+        REHEARSED_ON_ONE_CORE if mini else f"the paper's {per_scene:g} s per scene on one A100",
     )
     common: dict[str, Any] = {"real": data, "generated": home_path("generated"), "run": size}
     common |= {"inception": config.inception, "num_actors": workers, **shared}
