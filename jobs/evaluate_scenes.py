@@ -23,8 +23,9 @@ shifted or roughened. A score is worth reading for a fault if it rates the damag
 
 A protocol sets the options that it fixes. It is an error to give another value for such an option. paper-pr compares
 1,000 farthest training poses with 1,000 generated scenes (k = 3). paper-fid compares all training scenes with as many
-generated scenes, by FID, sFID and IS only, and reads the features part by part. pdd compares at most 50,000 generated
-scenes with training poses, and drops white pictures and pictures with a black pixel on both sides.
+generated scenes, by FID, sFID and IS only, and reads the features part by part. paper-nearest compares at most 50,000
+training scenes with as many generated scenes, only by distances of VGG16 features (--vgg16 FILE). pdd compares at most
+50,000 generated scenes with training poses, and drops white pictures and pictures with a black pixel on both sides.
 
 The job writes metrics.json, metrics.parquet and evaluation.html, and logs all results to MLflow. With --lvae, the job
 also writes reconstruction.html (the best and the worst scenes) and reconstruction.parquet (one row per scene). FID,
@@ -57,7 +58,7 @@ class Config:
     """Read only generated scenes of source generated-<run> (default: all sources)."""
     generated_source: str = ""
     """Read only generated scenes of this source, such as edited-<run> or imported-<name> (default: all sources)."""
-    protocol: Literal["", "paper-pr", "paper-fid", "pdd"] = ""
+    protocol: Literal["", "paper-pr", "paper-fid", "paper-nearest", "pdd"] = ""
     """Protocol that fixes the selection of scenes and the scores (default: none, the other options decide)."""
     max_scenes: int | None = None
     """Maximum number of real and of generated scenes; both numbers are equal. The paper uses 1000, 5000 and 10000

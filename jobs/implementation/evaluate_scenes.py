@@ -9,7 +9,7 @@ from rich.table import Table
 
 from jobs.evaluate_scenes import Config
 from jobs.implementation.checks import check_evaluate_scenes
-from jobs.implementation.protocols import PROTOCOLS, apply_protocol
+from jobs.implementation.protocols import PROTOCOLS, Protocol, apply_protocol
 from jobs.support.cli import home_path, make_absolute, resolve_path
 from jobs.support.lite0 import prepare_lite0
 from jobs.support.outputs import hold_output
@@ -109,12 +109,14 @@ def evaluate_generation(
     config: Config, dataset: Dataset | None, sides: dict[str, SceneSet], output: str, bar: JobProgress
 ) -> dict:
     """Score generated scenes, write evaluation.html, and write the features of each scene to described/."""
-    drops_blank = bool(config.protocol) and PROTOCOLS[config.protocol].drops_blank
+    protocol = PROTOCOLS[config.protocol] if config.protocol else Protocol("")
+    drops_blank, only_nearest = protocol.drops_blank, protocol.only_nearest
     looks = FeatureConfig(
         config.supersample,
         config.inception and make_absolute(config.inception),
-        prepare_lite0(config.lite0),
+        "" if only_nearest else prepare_lite0(config.lite0),
         vgg16=config.vgg16 and make_absolute(config.vgg16),
+        random=not only_nearest,
         blank=drops_blank,
     )
     described: dict[str, StoredFeatures] = {}
@@ -124,7 +126,7 @@ def evaluate_generation(
         task = bar.add_task(f"describe {name}", total=side.limit)
         directory = storage.join_uri(output, "described", name)
         described[name] = compute_scene_features(
-            side, dataset, how, directory, config.num_actors, lambda n: bar.advance(task, n)
+            side, None if only_nearest else dataset, how, directory, config.num_actors, lambda n: bar.advance(task, n)
         ).open()
         if drops_blank:
             described[name], dropped[name] = drop_blank(described[name])
@@ -143,7 +145,10 @@ def evaluate_generation(
     others = {name: part for name, part in described.items() if name == "ceiling" or name in CONTROLS}
     task = bar.add_task("compare", total=3)
     reference = read_reference_moments(sides["real"].path) if isinstance(sides["real"], ImageFile) else None
-    scores = compare_datasets(described["real"], described["generated"], classes, config.k, reference)
+    if only_nearest:
+        scores: dict = {"scenes": {name: count_scenes(sides[name]) for name in ("real", "generated")}}
+    else:
+        scores = compare_datasets(described["real"], described["generated"], classes, config.k, reference)
     bar.advance(task)
     if others:
         scores["sets"] = score_sets(described["real"], others, classes, config.k)
@@ -290,6 +295,8 @@ def select_protocol_sides(
                     f"--protocol {config.protocol} needs {needed[name]} {name} scenes, but {sides[name].root} has"
                     f" {count}"
                 )
+    if PROTOCOLS[config.protocol].only_nearest:
+        return {name: replace(side, limit=max(counts[name], 1)) for name, side in sides.items()}
     split = config.ceiling_split or "test"
     others = select_real(replace(config, max_scenes=counts["generated"] or None), dataset, split)
     if (count := count_scenes(others)) >= counts["generated"]:

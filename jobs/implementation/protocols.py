@@ -25,6 +25,7 @@ class Protocol:
         choices: Allowed values of options that the protocol leaves to the user; the first value is the default.
         num_generated: Number of generated scenes; None means as many as reference scenes.
         is_exact: Whether fewer scenes on a side are an error.
+        only_nearest: Whether only distances to the nearest real scene are computed, with VGG16 and without a ceiling.
         is_streamed: Whether only Frechet distances and the Inception score are computed, part by part.
         drops_blank: Whether white pictures and pictures with a black pixel are dropped on both sides.
     """
@@ -35,6 +36,7 @@ class Protocol:
     choices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     num_generated: int | None = None
     is_exact: bool = True
+    only_nearest: bool = False
     is_streamed: bool = False
     drops_blank: bool = False
 
@@ -43,6 +45,7 @@ class Protocol:
 COMMON = {"real_split": "train", "supersample": 1}
 ALL_SCENES = "uses all scenes of the training split"
 ONLY_MOMENTS = "computes only Frechet distances and the Inception score"
+ONLY_NEAREST = "computes only distances to the nearest real scene"
 PROTOCOLS: dict[str, Protocol] = {
     "paper-pr": Protocol(
         "precision and recall as in the paper: 1,000 farthest training poses, 1,000 generated scenes, k = 3",
@@ -54,6 +57,15 @@ PROTOCOLS: dict[str, Protocol] = {
         COMMON,
         {"max_scenes": ALL_SCENES, "reference": ALL_SCENES} | dict.fromkeys(("k", "peers", "vgg16"), ONLY_MOMENTS),
         is_streamed=True,
+    ),
+    "paper-nearest": Protocol(
+        "distances to the nearest training scene as in the paper's supplement G: 50,000 training scenes, evenly spread,"
+        " and 50,000 generated scenes, or all if there are fewer",
+        COMMON | {"max_scenes": 50_000, "reference": "uniform"},
+        dict.fromkeys(("k", "peers", "inception", "ceiling_split"), ONLY_NEAREST),
+        num_generated=50_000,
+        is_exact=False,
+        only_nearest=True,
     ),
     "pdd": Protocol(
         "the variant of the PDD fork: at most 50,000 generated scenes, training poses by --reference, without white"
@@ -100,6 +112,10 @@ def apply_protocol(config: Config) -> Config:
         _reject(config, "real", "which selects training scenes and needs a dataset directory")
     if config.ceiling_split == "halves":
         _reject(config, "ceiling_split", "which uses the whole training split as reference")
+    if protocol.only_nearest and config.controls:
+        raise ValueError(f"--controls conflicts with --protocol {config.protocol}, which {ONLY_NEAREST}")
+    if protocol.only_nearest and not config.vgg16:
+        raise ValueError(f"--protocol {config.protocol} needs VGG16 weights; add --vgg16 FILE")
     if protocol.is_streamed and config.inception and config.lite0:
         _reject(config, "lite0", "which computes features of EfficientNet-Lite0 only without --inception")
     values = {name: _get_or_default(config, name) for name in DEFAULTS} | dict(protocol.values)

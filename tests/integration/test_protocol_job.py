@@ -5,12 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import safetensors.numpy
+from golden.golden_recipe import random_state_dict
 
 from jobs.evaluate_scenes import Config
 from jobs.implementation.evaluate_scenes import evaluate
 from jobs.implementation.protocols import PROTOCOLS
 from pipelines.evaluation.features import load_scenes
 from pipelines.metrics.adm_npz import write_npz
+from pipelines.metrics.vgg16 import VGG16
 from pipelines.rendering.render import render_bev
 from pipelines.reporting.evaluation_report import list_headlines
 from pipelines.schema.dataset import Dataset
@@ -67,6 +70,26 @@ def test_paper_fid_streams_all_training_scenes(data, tmp_path):
     assert "There is no ceiling" in (tmp_path / "b/evaluation.html").read_text()
     with pytest.raises(ValueError, match=rf"--controls with --protocol paper-fid needs {total} other real scenes"):
         evaluate(replace(base, controls=True, output=str(tmp_path / "c")))
+
+
+def test_paper_nearest_computes_only_distances_of_vgg16(data, tmp_path, monkeypatch):
+    """Half of the generated scenes are training scenes; the test split is not used."""
+    weights = str(tmp_path / "vgg16.safetensors")
+    shapes = {name: value.shape for name, value in VGG16().state_dict().items()}
+    safetensors.numpy.save_file(random_state_dict(shapes), weights)
+    values = dict(PROTOCOLS["paper-nearest"].values) | {"max_scenes": 6}
+    small = replace(PROTOCOLS["paper-nearest"], values=values, num_generated=4)
+    monkeypatch.setitem(PROTOCOLS, "paper-nearest", small)
+    write_npz(str(tmp_path / "same.npz"), [render_scenes(data, 32)[[0, 1, 2, 3]]], 4)
+    base = Config(real=data, generated=str(tmp_path / "same.npz"), protocol="paper-nearest", num_actors=1)
+    with pytest.raises(ValueError, match="--protocol paper-nearest needs VGG16 weights; add --vgg16 FILE"):
+        evaluate(replace(base, output=str(tmp_path / "a")))
+    with pytest.raises(ValueError, match="--controls conflicts with --protocol paper-nearest"):
+        evaluate(replace(base, vgg16=weights, controls=True, output=str(tmp_path / "a")))
+    found = evaluate(replace(base, vgg16=weights, output=str(tmp_path / "a")))["generation"]
+    assert set(found) == {"scenes", "memorisation", "protocol"} and found["scenes"] == {"real": 6, "generated": 4}
+    assert found["memorisation"]["real"]["mean"]["value"] > 0 and 0 < found["memorisation"]["copies"]["value"] <= 1
+    assert "supplement G" in (tmp_path / "a/evaluation.html").read_text()
 
 
 def test_pdd_drops_and_counts_blank_pictures(data, tmp_path):
