@@ -6,12 +6,12 @@ import io
 import os
 import platform
 import re
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from statistics import median
 
+import numpy as np
 import pyarrow as pa
 import torch
 
@@ -228,9 +228,9 @@ def train_variant(config: Branches, variant: str, seed: int, output: str) -> dic
     timed = variant if is_at_equal_time(config) else next(iter(select_variants(replace(config, only_variants=()))))
     steps = config.steps or measure_steps(config, timed, output)
     name = f"{config.name}-{make_slug(variant)}-seed{seed}"
-    training, started = prepare_variant(config, variant, name, seed, steps), time.perf_counter()
+    training = prepare_variant(config, variant, name, seed, steps)
     model = fit(training, config.num_workers, storage.join_uri(output, "models", f"{make_slug(variant)}-seed{seed}"))
-    seconds = time.perf_counter() - started
+    seconds = sum_training_seconds(training.tracker.history("scenes_per_second"), training.stream.batch_size)
     root = training.identity["dataset"]
     source = training.stream.shards[0].source
     records = storage.join_uri(output, "reconstructed", f"{make_slug(variant)}-seed{seed}")
@@ -245,6 +245,17 @@ def train_variant(config: Branches, variant: str, seed: int, output: str) -> dic
     if trained.config["branches"] != "ground":
         scores |= ablation.measure_accuracy(trained, selection)
     return described | ablation.select_measures(select_variants(config)[variant], scores)
+
+
+def sum_training_seconds(rates: Sequence[tuple[int, float]], batch_size: int) -> float:
+    """Return the time of all training steps (s), also of a run that was interrupted and resumed.
+
+    Args:
+        rates: Step and scenes per second since the entry before.
+        batch_size: Samples per step.
+    """
+    steps = np.diff([0, *(step for step, _ in rates)])
+    return float(sum(steps * batch_size / np.array([rate for _, rate in rates])))
 
 
 def count_gflops(model: LayoutVAE, batch: LayoutBatch) -> float:
@@ -290,7 +301,7 @@ def guard_study(output: str, options: dict) -> None:
         discard=lambda: None,
         describe=lambda difference: (
             f"{output} holds a study with {difference}; "
-            "use the same options to resume, or another --output for a new study"
+            "use the same options to resume, or another --output for a new study (and another --name, if it has one)"
         ),
     )
 

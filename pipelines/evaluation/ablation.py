@@ -399,8 +399,6 @@ def group_by_variant(scores: Iterable[dict]) -> list[dict]:
     rows, scores = [], list(scores)
     for variant in dict.fromkeys(row["variant"] for row in scores):
         found = [row for row in scores if row["variant"] == variant]
-        if not found:
-            continue
         out: dict = {"variant": variant, "seeds": len(found), "steps": found[0]["steps"]}
         out |= {name: found[0][name] for name in ("parameters", "gflops")}
         out["training_seconds"] = float(np.mean([row["training_seconds"] for row in found]))

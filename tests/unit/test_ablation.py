@@ -10,6 +10,7 @@ import torch
 from helpers import random_scene, small_spec
 from scipy.spatial.transform import Rotation
 
+from jobs.implementation.ablate_lvae import sum_training_seconds
 from models.batch import LayoutBatch
 from models.geometry.encodings import ENCODINGS, compute_harmonics, find_nearest_frame
 from models.layout import LayoutSpec
@@ -338,3 +339,9 @@ def test_decoder_that_ignores_latents_is_as_wrong_as_the_control(tmp_path):
     blind = SimpleNamespace(spec=spec, encode=encode, decode=lambda z: decode(constant.expand(len(z), -1, -1)))
     scores = measure_accuracy(blind, selection)
     assert scores["median_center_error_m"] == scores["control_center_error_m"] > 1
+
+
+def test_training_time_covers_all_parts_of_a_resumed_run():
+    rates = [(50, 10.0), (100, 20.0), (120, 5.0)]  # Batches of 4: 20 s, 10 s and 16 s.
+    assert sum_training_seconds(rates, 4) == pytest.approx(46.0)
+    assert sum_training_seconds([], 4) == 0.0
