@@ -1,6 +1,6 @@
 """Measure sampling and training of the paper's networks on a GPU, without Ray and without internet access.
 
-    python benchmarks/gpu.py --output DIR                          all sections; `learn` stops after 8 minutes
+    python benchmarks/gpu.py --output DIR --scenes town.safetensors        all sections; `learn` stops after 8 minutes
     python benchmarks/gpu.py --output DIR --only latency train_dit
     python benchmarks/gpu.py --output DIR --only learn --scenes town.safetensors      continues where it stopped
     python benchmarks/gpu.py --output DIR --cpu                    rehearsal with tiny networks, a minute
@@ -28,6 +28,7 @@ import argparse
 import json
 import os
 import platform
+import shutil
 import statistics
 import subprocess
 import sys
@@ -52,10 +53,11 @@ from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTConfig, DiTPreset, LVAEPreset
 from models.training import (
     ExecutionConfig,
-    OptimizerConfig,
     Trainer,
     count_flops,
+    make_dit_settings,
     make_dit_trainer,
+    make_lvae_settings,
     make_lvae_trainer,
 )
 from models.vae import losses
@@ -63,12 +65,14 @@ from models.vae.accuracy import compute_accuracy, pair_primitives
 
 ROOT = Path(__file__).parents[1]
 LEARN_SECONDS = 480.0
+SAVE_SECONDS = 60.0  # Interval of the checkpoints of `learn`.
 FIELDS = ("height", "occupied", "features", "real")
 MAX_SCENES_BYTES = 20_000_000
 HELD_OUT = 16  # Scenes of `learn` that are not trained on.
 DIT_NAMES = {"kitti360": "DiT-B", "kitti360-l": "DiT-L", "kitti360-xl": "DiT-XL"}
-# One scene of DiT-B with 250 steps.
-PAPER_LATENCY, TARGET_LATENCY, TARGET_MEMORY = "0.58 (A100)", "<= 0.15", "<= 0.6"
+# One scene with 250 steps (supplement B.3), and targets for DiT-B.
+PAPER_LATENCY = {"kitti360": "0.58 (A100)", "kitti360-l": "1.78 (A100)", "kitti360-xl": "2.11 (A100)"}
+TARGET_LATENCY, TARGET_MEMORY, PAPER_MEMORY = "<= 0.15", "<= 0.6", "0.89 (A100)"
 
 
 @dataclass(frozen=True)
@@ -213,15 +217,16 @@ def run_latency(setup: Setup) -> Iterator[Row]:
                 for steps in (setup.choose(250, 10), setup.choose(20, 5)):
                     sampling, decoding = measure_scene(setup, pipeline, steps)
                     target, paper = "", ""
-                    if steps == 250 and name == "kitti360":
-                        target, paper = TARGET_LATENCY if main in kind else "", PAPER_LATENCY
+                    if steps == 250:
+                        paper = PAPER_LATENCY[name]
+                        target = TARGET_LATENCY if main in kind and name == "kitti360" else ""
                     note = f"decoding {100 * decoding / (sampling + decoding):.0f} %"
                     quantity = f"{label}, one scene, {steps} steps, {kind}"
                     yield Row(quantity, sampling + decoding, "s", target, paper, note)
             if memory:
-                target = TARGET_MEMORY if name == "kitti360" and kind == main else ""
-                note = "without encoders"
-                yield Row(f"{label}, peak memory, batch 1, {kind}", memory["peak_gb"], "GB", target, note=note)
+                target, paper = (TARGET_MEMORY, PAPER_MEMORY) if name == "kitti360" and kind == main else ("", "")
+                quantity = f"{label}, peak memory, batch 1, {kind}"
+                yield Row(quantity, memory["peak_gb"], "GB", target, paper, "without encoders")
 
 
 def count_denoising_step(setup: Setup, pipeline: PrITTIPipeline) -> float:
@@ -361,9 +366,7 @@ def make_dit_for_training(setup: Setup, precision: str, compiled: bool = False) 
     preset, shape = setup.dit_preset("kitti360"), setup.make_lvae("kitti360").latent_shape
     torch.manual_seed(0)
     dit = DiT(**preset.architecture(), channels=shape[0], size=shape[1])
-    settings = OptimizerConfig(
-        preset.steps, preset.learning_rate, preset.weight_decay, grad_clip=preset.grad_clip, ema_decay=preset.ema_decay
-    )
+    settings = make_dit_settings(preset)
     execution = ExecutionConfig(precision=precision, compile=compiled)
     return make_dit_trainer(dit, settings, preset.label_dropout, setup.device, execution=execution)
 
@@ -373,9 +376,7 @@ def make_lvae_for_training(setup: Setup, precision: str, steps: int = 0, batch: 
     lvae.to(setup.device)
     if batch is not None and preset.init_from_data:
         lvae.init_from_data(LayoutBatch.from_compact(batch))
-    settings = OptimizerConfig(
-        steps or preset.steps, preset.learning_rate, preset.weight_decay, preset.final_learning_rate
-    )
+    settings = make_lvae_settings(replace(preset, steps=steps or preset.steps))
     return make_lvae_trainer(
         lvae, settings, preset.kl_weight, setup.device, execution=ExecutionConfig(precision=precision)
     )
@@ -416,8 +417,8 @@ def run_train_dit(setup: Setup) -> Iterator[Row]:
         def attempt(batch: int, trainer: Trainer = trainer) -> None:
             trainer.step(draw_posteriors(trainer, batch), range(batch))
 
+        batch = find_fitting_batch(wanted, attempt)
         with measure_memory(setup, memory):
-            batch = find_fitting_batch(wanted, attempt)
             seconds = setup.time_call(partial(step, draw_posteriors(trainer, batch)), setup.choose(10, 2))
         mfu = setup.measure_mfu(batch * count_training_step(trainer), seconds)
         note = ("compiled" if compiled else "not compiled") + describe_fit(wanted, batch)
@@ -446,9 +447,9 @@ def run_train_lvae(setup: Setup) -> Iterator[Row]:
         matching_s.append(time.perf_counter() - started)
         return found
 
+    batch = find_fitting_batch(wanted, lambda batch: trainer.step(layouts.draw(0, batch), range(batch)))
+    arrays = layouts.draw(0, batch)
     with measure_memory(setup, memory):
-        batch = find_fitting_batch(wanted, lambda batch: trainer.step(layouts.draw(0, batch), range(batch)))
-        arrays = layouts.draw(0, batch)
         seconds = setup.time_call(lambda: trainer.step(arrays, range(batch)), setup.choose(10, 2))
         losses.match_primitives = match_timed
         try:
@@ -511,6 +512,19 @@ def measure_primitives(model: LayoutVAE, arrays: dict[str, torch.Tensor]) -> dic
     }
 
 
+def save_checkpoint(trainer: Trainer, folder: Path) -> None:
+    """Save a checkpoint under `folder`; the one before is removed after the new one is complete."""
+    folder.mkdir(parents=True, exist_ok=True)
+    new, old, current = folder / "new", folder / "old", folder / "checkpoint"
+    for path in (new, old):
+        shutil.rmtree(path, ignore_errors=True)
+    trainer.save(new)
+    if current.exists():
+        current.rename(old)
+    new.rename(current)
+    shutil.rmtree(old, ignore_errors=True)
+
+
 def run_learn(setup: Setup) -> Iterator[Row]:
     """Train a layout VAE on the scenes for at most LEARN_SECONDS, from the last checkpoint."""
     if not setup.scenes and not setup.tiny:
@@ -519,15 +533,19 @@ def run_learn(setup: Setup) -> Iterator[Row]:
     layouts, steps, batch = Layouts(setup, setup.spec(preset)), setup.choose(setup.steps, 4), setup.choose(32, 2)
     trainer = make_lvae_for_training(setup, "auto", steps, layouts.draw(0, min(64, len(layouts))))
     folder = setup.output / "learn"
-    if (folder / "state.json").exists():
-        trainer.load(folder)
+    if (folder / "checkpoint/state.json").exists():
+        trainer.load(folder / "checkpoint")
     first, started, curve = trainer.steps_done, time.monotonic(), []
+    saved = started
     while trainer.steps_done < steps and time.monotonic() - started < LEARN_SECONDS - 60:
         found = trainer.step(layouts.draw(trainer.steps_done, batch), range(batch))
         if trainer.steps_done % 50 == 0 or trainer.steps_done == steps:
             curve.append((trainer.steps_done, {name: float(value) for name, value in found.items()}))
             print(f"  step {trainer.steps_done}: loss {curve[-1][1]['loss']:.4f}", flush=True)
-    trainer.save(folder)
+        if time.monotonic() - saved > SAVE_SECONDS:
+            save_checkpoint(trainer, folder)
+            saved = time.monotonic()
+    save_checkpoint(trainer, folder)
     trainer.model.save_pretrained(folder / "model")
     with (folder / "curve.jsonl").open("a") as stream:
         for step, values in curve:
@@ -594,7 +612,7 @@ def run_sections(setup: Setup, names: list[str]) -> int:
     setup.output.mkdir(parents=True, exist_ok=True)
     results = json.loads(path.read_text()) if path.exists() else {}
     for name in names:
-        started, rows = time.monotonic(), []
+        started, rows, is_complete = time.monotonic(), [], False
         print(f"{name}:", flush=True)
         try:
             for row in SECTIONS[name](setup):
@@ -602,10 +620,11 @@ def run_sections(setup: Setup, names: list[str]) -> int:
                     row = replace(row, quantity=f"tiny {row.quantity}", target="", paper="")
                 rows.append(vars(row))
                 print(f"  {row.quantity}: {row.value:.4g} {row.unit} {row.note}", flush=True)
+            is_complete = True
         except (ValueError, RuntimeError) as error:  # The other sections still run.
             failed += 1
             print(f"error: {name}: {error}", file=sys.stderr, flush=True)
-        if rows:
+        if rows and (is_complete or name not in results):  # Complete rows of an earlier run are kept.
             seconds = time.monotonic() - started
             results[name] = {"machine": describe_device(setup.device), "seconds": round(seconds, 1), "rows": rows}
         results = {section: results[section] for section in SECTIONS if section in results}
@@ -632,7 +651,11 @@ def main() -> int:
         print("error: torch finds no GPU; check nvidia-smi and the driver, or rehearse with --cpu", file=sys.stderr)
         return 2
     device = torch.device("cpu" if options.cpu else "cuda")
-    require_bf16(device)
+    try:
+        require_bf16(device)
+    except ValueError as error:
+        print(f"error: {str(error).partition(';')[0]}; use another GPU", file=sys.stderr)
+        return 2
     setup = Setup(device, options.cpu, options.peak_tflops, options.output, options.scenes, options.steps)
     failed = run_sections(setup, options.only)
     print(f"{options.output}/gpu.md")

@@ -30,6 +30,7 @@ from models.dit import DiT
 from models.execution import require_bf16
 from models.layout import FEATURES, LayoutSpec
 from models.lvae import LayoutVAE
+from models.presets import DiTPreset, LVAEPreset
 from models.sampling.diffusion import finish_drawing, make_keyed_generator, start_drawing
 from models.vae.losses import compute_lvae_loss
 from models.vae.matching import NonFiniteCostError
@@ -121,6 +122,50 @@ class ExecutionConfig:
         fast = device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
         wanted = self.precision == "bf16" or (self.precision == "auto" and fast)
         return torch.autocast(device.type, torch.bfloat16, enabled=wanted)
+
+
+def make_lvae_settings(preset: LVAEPreset, seed: int = 0) -> OptimizerConfig:
+    """Return the optimiser options of a preset of the layout VAE.
+
+    Args:
+        preset: Preset.
+        seed: Seed of all random numbers.
+
+    Returns:
+        Options; beta1 has the defaults of torch's OneCycleLR, as in SLEDGE.
+    """
+    return OptimizerConfig(
+        steps=preset.steps,
+        learning_rate=preset.learning_rate,
+        final_learning_rate=preset.final_learning_rate,
+        weight_decay=preset.weight_decay,
+        warmup_steps=preset.warmup_steps,
+        cycle_momentum=(0.85, 0.95),
+        grad_clip=preset.grad_clip or None,
+        ema_decay=preset.ema_decay,
+        seed=seed,
+    )
+
+
+def make_dit_settings(preset: DiTPreset, seed: int = 0) -> OptimizerConfig:
+    """Return the optimiser options of a preset of the diffusion transformer.
+
+    Args:
+        preset: Preset.
+        seed: Seed of all random numbers.
+
+    Returns:
+        Options; the betas are those of SLEDGE.
+    """
+    return OptimizerConfig(
+        steps=preset.steps,
+        learning_rate=preset.learning_rate,
+        weight_decay=preset.weight_decay,
+        betas=(0.95, 0.999),
+        grad_clip=preset.grad_clip,
+        ema_decay=preset.ema_decay,
+        seed=seed,
+    )
 
 
 class NonFiniteLossError(ValueError):

@@ -38,7 +38,15 @@ from models.labels import LABELS
 from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTPreset, find_preset
-from models.training import ExecutionConfig, OptimizerConfig, TimestepSampling, Trainer, Wrap, make_dit_trainer
+from models.training import (
+    ExecutionConfig,
+    OptimizerConfig,
+    TimestepSampling,
+    Trainer,
+    Wrap,
+    make_dit_settings,
+    make_dit_trainer,
+)
 from pipelines.generation.sample import load_pipeline
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
@@ -153,15 +161,7 @@ def load_encoder(latents: dict, latents_root: str) -> LayoutVAE:
 def make_optimizer_config(config: Config, row: DiTPreset) -> OptimizerConfig:
     """Return the optimizer settings of the preset with the options that override them."""
     return trainer.override_settings(
-        OptimizerConfig(
-            steps=row.steps,
-            learning_rate=row.learning_rate,
-            weight_decay=row.weight_decay,
-            betas=(0.95, 0.999),  # as in SLEDGE
-            grad_clip=row.grad_clip,
-            ema_decay=row.ema_decay,
-            seed=config.seed,
-        ),
+        make_dit_settings(row, config.seed),
         steps=config.steps,
         learning_rate=config.learning_rate,
         final_learning_rate=config.final_learning_rate,

@@ -28,7 +28,14 @@ from models.batch import LayoutBatch
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.presets import LVAE_PRESETS, LVAEPreset, find_preset
-from models.training import ExecutionConfig, OptimizerConfig, Trainer, Wrap, make_lvae_trainer
+from models.training import (
+    ExecutionConfig,
+    OptimizerConfig,
+    Trainer,
+    Wrap,
+    make_lvae_settings,
+    make_lvae_trainer,
+)
 from pipelines.generation.sample import load_pipeline
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
@@ -121,17 +128,7 @@ def resolve_preset(config: Config) -> LVAEPreset:
 def make_optimizer_config(config: Config, row: LVAEPreset) -> OptimizerConfig:
     """Return the optimizer settings of the preset with the options that override them."""
     return trainer.override_settings(
-        OptimizerConfig(
-            steps=row.steps,
-            learning_rate=row.learning_rate,
-            final_learning_rate=row.final_learning_rate,
-            weight_decay=row.weight_decay,
-            warmup_steps=row.warmup_steps,
-            cycle_momentum=(0.85, 0.95),  # OneCycleLR's defaults, as in SLEDGE
-            grad_clip=row.grad_clip or None,
-            ema_decay=row.ema_decay,
-            seed=config.seed,
-        ),
+        make_lvae_settings(row, config.seed),
         steps=config.steps,
         learning_rate=config.learning_rate,
     )

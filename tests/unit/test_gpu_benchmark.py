@@ -47,14 +47,16 @@ def test_rehearsal_needs_only_models_and_sections_merge(tmp_path):
     values = [row["value"] for section in results.values() for row in section["rows"]]
     assert np.isfinite(values).all() and min(values) >= 0
     assert (tmp_path / "learn/model/config.json").exists()
-    learned = json.loads((tmp_path / "learn/state.json").read_text())["steps_done"]
+    learned = json.loads((tmp_path / "learn/checkpoint/state.json").read_text())["steps_done"]
     again = run_isolated("--cpu", "--output", str(tmp_path), "--only", "train_dit", "learn")
     assert again.returncode == 0, again.stderr[-3000:]
     merged = json.loads((tmp_path / "gpu.json").read_text())
     assert {name: merged[name] for name in ("latency", "precision")} == {
         n: results[n] for n in ("latency", "precision")
     }
-    assert json.loads((tmp_path / "learn/state.json").read_text())["steps_done"] == learned  # All steps were done.
+    assert (
+        json.loads((tmp_path / "learn/checkpoint/state.json").read_text())["steps_done"] == learned
+    )  # All steps were done.
     table = (tmp_path / "gpu.md").read_text()
     rows = sum(len(section["rows"]) for section in merged.values())
     assert table.count("\n| tiny ") == rows
@@ -116,6 +118,13 @@ def test_failed_section_does_not_stop_the_others(tmp_path, monkeypatch, capsys):
     assert "error: latency: CUDA error" in capsys.readouterr().err
     table = (tmp_path / "gpu.md").read_text()
     assert "| first | 1 s |" in table and "| second | 2 s | <= 3 |" in table
+    complete = iter([gpu.Row("first", 3.0, "s"), gpu.Row("last", 4.0, "s")])
+    monkeypatch.setitem(gpu.SECTIONS, "latency", lambda setup: complete)
+    assert gpu.run_sections(setup, ["latency"]) == 0
+    monkeypatch.setitem(gpu.SECTIONS, "latency", fail)
+    assert gpu.run_sections(setup, ["latency"]) == 1
+    table = (tmp_path / "gpu.md").read_text()
+    assert "| first | 3 s |" in table and "| last | 4 s |" in table  # The rows of the complete run are kept.
 
 
 def test_primitives_of_a_perfect_decoder_are_all_found():
