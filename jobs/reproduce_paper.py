@@ -34,7 +34,7 @@ class PaperOptions:
     """Size of the networks and number of steps: as in the paper, or a rehearsal with small networks on two cores."""
     output: str = ""
     """Directory to write all files to: data, runs, models, tables, and MLflow's database if it is local (default:
-    $PRITTI_HOME/paper-<dataset>)."""
+    $PRITTI_HOME/paper-<dataset>, with --scale mini paper-<dataset>-mini)."""
     dry_run: bool = False
     """Print the plan and stop."""
     transformers: tuple[Literal["b", "l", "xl"], ...] = ("b",)

@@ -36,7 +36,7 @@ class LVAEPreset:
             sampled latents. The paper adds no noise.
         init_from_data: If True, training starts from the means of the data and a small posterior variance
             (`LayoutVAE.init_from_data`). If False, it starts from random weights, those of DETR in the
-            transformers and those of torch elsewhere, because the paper mentions no other start.
+            decoder's transformer and those of torch elsewhere, because the paper mentions no other start.
     """
 
     source: str

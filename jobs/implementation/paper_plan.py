@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
 from jobs.ablate_lvae import Branches
@@ -23,6 +23,7 @@ from pipelines.schema.splits import TEST, TRAIN
 
 MINI_SCENES, MINI_LVAE_STEPS, MINI_DIT_STEPS = 96, 1000, 1000
 PAPER_SCENES = 1000  # Scenes for precision and recall.
+MIN_SCENES = 4  # Precision and recall compare each scene with three neighbours.
 NEAREST_SCENES = 50_000  # Generated and training scenes of supplement G.
 SWEEPS_PER_LOG = 156.5  # Argoverse 2: 313 sweeps in two logs.
 # Measured by benchmarks/cost_rates.py: CPU time (s) and stored bytes per scene.
@@ -72,9 +73,9 @@ class Stage:
 
 @dataclass(frozen=True)
 class Counts:
-    """Number of poses per split of the raw dataset, for Argoverse 2 estimated from the number of logs.
+    """Number of scenes per split: of the dataset, or before preprocessing, of the poses.
 
-    Scenes without ground or with gaps are rejected later.
+    The poses of Argoverse 2 are estimated from the number of logs. Scenes without ground or with gaps are rejected.
     """
 
     train: int
@@ -113,9 +114,23 @@ def count_poses(config: PaperConfig) -> Counts:
                 f" add {missing}"
             )
     found = Counts(round(counts[TRAIN]), round(counts[TEST]))
+    check_counts(config, found)
+    return found
+
+
+def check_counts(config: PaperConfig, found: Counts) -> None:
+    """Check that there are enough scenes for the protocols.
+
+    Raises:
+        ValueError: A protocol needs more training scenes or generated scenes.
+    """
+    limits = {"training": found.train, "test": found.test, "generated": count_scenes(config, found)}
+    for side, count in limits.items():
+        if config.scale == "mini" and count < MIN_SCENES:
+            raise ValueError(f"there are {count} {side} scenes, but the evaluation needs at least {MIN_SCENES}")
     if config.scale == "paper" and found.train < PAPER_SCENES:
         raise ValueError(
-            f"{make_absolute(config.input)} has {found.train} training poses, but the paper's protocol compares"
+            f"{make_absolute(config.input)} has {found.train} training scenes, but the paper's protocol compares"
             f" {PAPER_SCENES:,}; use --scale mini, or a larger part of the dataset"
         )
     if config.scale == "paper" and config.num_scenes and config.num_scenes < found.train:
@@ -123,7 +138,6 @@ def count_poses(config: PaperConfig) -> Counts:
             f"--num-scenes is {config.num_scenes}, but the paper's protocol compares as many generated scenes as"
             f" training scenes; use at least {found.train}, or --scale mini"
         )
-    return found
 
 
 def make_plan(config: PaperConfig, counts: Counts) -> list[Stage]:
@@ -149,7 +163,8 @@ def find_presets(config: PaperConfig, size: str) -> tuple[str, str]:
 
 def count_scenes(config: PaperConfig, counts: Counts) -> int:
     """Return the number of scenes to generate per transformer."""
-    return config.num_scenes or (MINI_SCENES if config.scale == "mini" else max(counts.train, PAPER_SCENES))
+    wanted = MINI_SCENES if config.scale == "mini" else max(counts.train, PAPER_SCENES)
+    return wanted if config.num_scenes is None else config.num_scenes
 
 
 def _list_stages(config: PaperConfig, counts: Counts) -> Iterator[Stage]:
@@ -290,14 +305,15 @@ def _list_transformer_stages(
     # The paper reports these distances for one transformer on KITTI-360.
     if config.vgg16 and not mini and size == "b" and isinstance(config, Kitti360):
         count = min(scenes, NEAREST_SCENES)
+        nearest: dict[str, Any] = common | {"inception": ""}
         yield Stage(
             f"find the nearest training scenes of {title}",
             "evaluate_scenes",
-            replace(
-                EvaluateConfig(output=home_path("evaluations", f"{size}-nearest"), vgg16=config.vgg16, **common),
-                max_scenes=count,
-                reference="uniform",
-                inception="",
+            EvaluateConfig(
+                protocol="paper-nearest",
+                vgg16=config.vgg16,
+                output=home_path("evaluations", f"{size}-nearest"),
+                **nearest,
             ),
             2 * EVALUATE_S * count / 2 / 3600,
             2 * count * FEATURE_BYTES / 1e9,

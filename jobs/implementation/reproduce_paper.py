@@ -20,8 +20,10 @@ from jobs.implementation.evaluate_scenes import evaluate
 from jobs.implementation.paper_plan import (
     NEAREST_SCENES,
     PAPER_SCENES,
+    Counts,
     PaperConfig,
     Stage,
+    check_counts,
     count_poses,
     find_presets,
     find_source,
@@ -29,13 +31,14 @@ from jobs.implementation.paper_plan import (
 )
 from jobs.implementation.sample_scenes import sample
 from jobs.reproduce_paper import Av2
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import home_path, make_absolute, require_tracking_uri
 from jobs.support.outputs import hold_output
 from jobs.support.ray_session import start_ray
 from jobs.support.stages import Stages
 from jobs.support.terminal import print_table
 from models.presets import LVAE_PRESETS
 from models.uris import is_uri
+from pipelines.evaluation.features import load_cached_inception, load_cached_vgg16
 from pipelines.evaluation.reconstruction import score_limits
 from pipelines.reporting.paper_tables import Reproduced, build_paper_tables, compare_with_paper, format_paper_tables
 from pipelines.reporting.report import Table, Text, render_report_html
@@ -58,11 +61,14 @@ CONTROL = "objects moved by up to 4 m"
 
 def main(config: PaperConfig) -> None:
     source = find_source(config)
-    home = make_absolute(config.output) if config.output else home_path(f"paper-{source}")
+    mini = "-mini" if config.scale == "mini" else ""
+    home = make_absolute(config.output) if config.output else home_path(f"paper-{source}{mini}")
     check_options(config)
     os.environ["PRITTI_HOME"] = home
     if not is_uri(home):  # The job writes all files under the output directory.
         os.environ.pop("MLFLOW_TRACKING_URI", None)
+    require_tracking_uri()
+    guard_scale(config, home)
     counts = count_poses(config)
     plan = make_plan(config, counts)
     about = "about " if isinstance(config, Av2) else ""
@@ -71,20 +77,36 @@ def main(config: PaperConfig) -> None:
     if config.dry_run:
         return
     require_space(plan, home)
+    check_networks(config)
     start_ray(training=True)
     require_gpus(config)
+    storage.write_json({"scale": config.scale}, home_path("scale.json"))
     stages = Stages(home_path("stages.json"), total=len(plan) + 1)
-    for stage in plan:
+    first, *later = plan
+    stages.run(first.name, lambda: RUN[first.job](first.config))
+    # Preprocessing rejects scenes, and the sweeps of Argoverse 2 were estimated.
+    scenes = Dataset.open(home_path("datasets", source)).scenes
+    counts = Counts(scenes.get("train", 0), scenes.get("test", 0))
+    check_counts(config, counts)
+    later = make_plan(config, counts)[1:]
+    for stage in later:
         stages.run(stage.name, lambda stage=stage: RUN[stage.job](stage.config))
     stages.run("write the tables", lambda: write_tables(config, stages.seconds))
 
 
 def check_options(config: PaperConfig) -> None:
-    """Check the files of weights and the transformers before the first stage.
+    """Check the numbers, the files of weights and the transformers before the first stage.
 
     Raises:
-        ValueError: A file is missing, or the paper has no such transformer on the dataset.
+        ValueError: A number is not positive, a file is missing, or the paper has no such numbers on the dataset.
     """
+    for name in ("num_workers", "lvae_steps", "dit_steps", "num_scenes", "num_inference_steps"):
+        value = getattr(config, name)
+        if value is not None and value < 1:
+            raise ValueError(f"--{name.replace('_', '-')} is {value}, expected 1 or more")
+    if isinstance(config, Av2) and (config.ablations or config.vgg16):
+        option = "--ablations" if config.ablations else "--vgg16"
+        raise ValueError(f"{option}: the paper has these rows only for KITTI-360; omit it")
     for option, path in (("--inception", config.inception), ("--vgg16", config.vgg16)):
         if path and not storage.exists(make_absolute(path)):
             raise ValueError(f"{option} {path} does not exist")
@@ -95,6 +117,30 @@ def check_options(config: PaperConfig) -> None:
         )
     if not config.transformers or len(set(config.transformers)) != len(config.transformers):
         raise ValueError(f"--transformers {' '.join(config.transformers)}: expected different sizes of b, l and xl")
+
+
+def check_networks(config: PaperConfig) -> None:
+    """Load the files of weights, so that a wrong file stops the job before hours of training.
+
+    Raises:
+        ValueError: A file does not hold the weights of the network.
+    """
+    for path, load in ((config.inception, load_cached_inception), (config.vgg16, load_cached_vgg16)):
+        if path:
+            load(*storage.fingerprint_file(make_absolute(path)))
+            load.cache_clear()
+
+
+def guard_scale(config: PaperConfig, home: str) -> None:
+    """Raise an error if the output directory belongs to a run with the other scale.
+
+    Raises:
+        ValueError: The scales differ.
+    """
+    path = storage.join_uri(home, "scale.json")
+    found = storage.read_json(path)["scale"] if storage.exists(path) else config.scale
+    if found != config.scale:
+        raise ValueError(f"{home} holds a run with --scale {found}; choose another --output")
 
 
 def print_plan(plan: list[Stage], home: str) -> None:
@@ -129,13 +175,21 @@ def require_space(plan: list[Stage], home: str) -> None:
 
 
 def require_gpus(config: PaperConfig) -> None:
-    """Raise an error if the networks of the paper would be trained on CPUs.
+    """Raise an error if the networks of the paper would be trained on CPUs, or if there are too few GPUs.
 
     Raises:
-        ValueError: The cluster has no GPU.
+        ValueError: The cluster has no GPU, or fewer than the workers need.
     """
     wants = config.gpus is None or config.gpus > 0
-    if config.scale == "paper" and wants and not config.wait_for_resources_s and not count_gpus():
+    if not wants or config.wait_for_resources_s:
+        return
+    found, needed = count_gpus(), config.num_workers * (config.gpus or 1)
+    if 0 < found < needed:
+        raise ValueError(
+            f"--num-workers {config.num_workers} needs {needed:g} GPUs, but this cluster has {found:g}; use fewer"
+            " workers, or --wait-for-resources if an autoscaler adds GPUs"
+        )
+    if config.scale == "paper" and not found:
         raise ValueError(
             "the networks of the paper need GPUs, but this cluster has none; use --scale mini for a rehearsal,"
             " --wait-for-resources if an autoscaler adds GPUs, or --gpus 0 to train on CPUs for months"
@@ -171,7 +225,7 @@ def describe_run(config: PaperConfig) -> list[str]:
     """Return sentences that describe the run."""
     source = find_source(config)
     dataset = Dataset.open(home_path("datasets", source))
-    presets = dict.fromkeys(name for size in config.transformers for name in find_presets(config, size))
+    presets = dict.fromkeys(name for size in list_evaluated_sizes(config) for name in find_presets(config, size))
     described = [
         f"Dataset {source}: {make_absolute(config.input)}, {dataset.spec.num_slots} slots per scene.",
         f"Presets {', '.join(presets)}; seed {config.seed}.",
@@ -179,6 +233,8 @@ def describe_run(config: PaperConfig) -> list[str]:
         f" control also has {CONTROL} and the ground shifted by 4 m. The ceiling of a generation score is the score of"
         f" other real scenes, its control that of real scenes with {CONTROL}.",
     ]
+    if config.ablations:
+        described.append("The ablations of the layout VAE have seed 0.")
     if config.scale == "mini":
         described.insert(0, "This is a rehearsal with small networks. Its scores say nothing about the paper's model.")
     return described
@@ -200,9 +256,11 @@ def collect_scores(config: PaperConfig) -> Reproduced:
         ours |= {"ablation": {row["variant"]: row for row in storage.read_json(study)["rows"]}}
     notes: dict[str, str] = {}
     generation = {}
-    for size in config.transformers:
+    for size in list_evaluated_sizes(config):
         scores = read_generation(f"{size}-precision")
-        sides = scores.get("sets", {})
+        has_ceiling = "sets" in scores
+        sides = scores.setdefault("sets", {})
+        sides.setdefault("ceiling", {})["inception_score"] = scores.get("inception_score_real")
         scores["fid_small"] = scores.get("fid")
         for side in sides.values():
             side["fid_small"] = side.get("fid")
@@ -213,12 +271,13 @@ def collect_scores(config: PaperConfig) -> Reproduced:
             for side in sides.values():
                 side.pop("fid", None)
             notes["fid"] = "all training scenes; the test split is too small for a ceiling of the same size"
-            notes["inception_score"] = "of all generated scenes; ceiling and control: of 1,000"
+            notes["inception_score"] = "of all generated scenes; ceiling: all training scenes"
+            sides["ceiling"]["inception_score"] = read_generation(f"{size}-fid").get("inception_score_real")
         else:
             count = f"{scores['scenes']['generated']:,} scenes instead of"
             notes |= dict.fromkeys(("precision_k3", "recall_k3"), f"{count} {PAPER_SCENES:,}")
             notes |= dict.fromkeys(("fid", "inception_score"), f"{count} as many as the training split has")
-        if "sets" not in scores:
+        if not has_ceiling:
             notes |= dict.fromkeys(("precision_k3", "recall_k3", "fid_small"), "too few test scenes for a ceiling")
         nearest = f"{size}-precision" if config.scale == "mini" else f"{size}-nearest"
         if storage.exists(home_path("evaluations", nearest, "metrics.json")):
@@ -227,6 +286,15 @@ def collect_scores(config: PaperConfig) -> Reproduced:
             notes |= describe_memorisation(compared)
         generation[size] = scores
     return Reproduced({"ours": ours} | storage.read_json(path), generation, notes)
+
+
+def list_evaluated_sizes(config: PaperConfig) -> list[str]:
+    """Return the transformers of this run and of earlier runs in the same output directory."""
+
+    def is_evaluated(size: str) -> bool:
+        return storage.exists(home_path("evaluations", f"{size}-precision", "metrics.json"))
+
+    return [size for size in ("b", "l", "xl") if size in config.transformers or is_evaluated(size)]
 
 
 def describe_memorisation(scores: Mapping[str, Any]) -> dict[str, str]:

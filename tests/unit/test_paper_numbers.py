@@ -3,7 +3,7 @@
 import ast
 import importlib.util
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import pytest
@@ -52,8 +52,15 @@ def test_field_has_the_number_of_the_paper(quantity, value, field, place):
 
 
 def test_av2_has_the_networks_of_the_paper():
-    assert LVAE_PRESETS["av2"].model == LVAE_PRESETS["kitti360"].model
-    assert DIT_PRESETS["av2"].model == DIT_PRESETS["kitti360"].model
+    assert replace(LVAE_PRESETS["av2"], source="kitti360") == LVAE_PRESETS["kitti360"]
+    assert replace(DIT_PRESETS["av2"], lvae="kitti360") == DIT_PRESETS["kitti360"]
+
+
+@pytest.mark.parametrize("name", ["kitti360-l", "kitti360-xl"])
+def test_larger_transformers_differ_only_in_size_and_steps(name):
+    base, larger = DIT_PRESETS["kitti360"], DIT_PRESETS[name]
+    assert replace(larger, model=base.model, steps=base.steps) == base
+    assert replace(larger.model, depth=12, width=768, heads=12) == base.model
 
 
 def count_training_flops(name: str) -> float:

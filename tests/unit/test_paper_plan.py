@@ -10,8 +10,8 @@ import pytest
 import tyro
 from helpers import ROOT
 
-from jobs.implementation.paper_plan import Counts, count_poses, find_presets, make_plan
-from jobs.implementation.reproduce_paper import check_options, require_space
+from jobs.implementation.paper_plan import Counts, check_counts, count_poses, find_presets, make_plan
+from jobs.implementation.reproduce_paper import check_networks, check_options, guard_scale, require_space
 from jobs.reproduce_paper import Av2, Kitti360
 from models.presets import DIT_PRESETS, LVAE_PRESETS
 from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
@@ -54,10 +54,10 @@ def test_plan_of_the_paper_has_its_presets_and_numbers():
     assert stages["compute FID of DiT-XL over all scenes"].config.protocol == "paper-fid"
     assert stages["preprocess the drives"].config.slots == "paper"
     nearest = make_plan(PLANS[2], FULL)[-1]
-    assert nearest.name == "find the nearest training scenes of DiT-B" and nearest.config.max_scenes == 50_000
+    assert nearest.name == "find the nearest training scenes of DiT-B" and nearest.config.protocol == "paper-nearest"
     assert nearest.config.vgg16 == "v.pth" and not nearest.config.inception
-    for config in (Kitti360("/data", transformers=("l", "xl"), vgg16="v.pth"), Av2("/data", vgg16="v.pth")):
-        assert not any("nearest" in stage.name for stage in make_plan(config, FULL))
+    config = Kitti360("/data", transformers=("l", "xl"), vgg16="v.pth")
+    assert not any("nearest" in stage.name for stage in make_plan(config, FULL))
     for config in PLANS:
         for size in config.transformers:
             lvae, dit = find_presets(config, size)
@@ -70,7 +70,7 @@ def test_poses_of_town_drive_are_counted_before_preprocessing(tmp_path):
     counts = count_poses(config)
     lines = sum(len(path.read_text().splitlines()) for path in tmp_path.rglob("poses.txt"))
     assert counts.train > counts.test > 0 and counts.train + counts.test <= lines
-    with pytest.raises(ValueError, match="training poses, but the paper's protocol compares 1,000; use --scale mini"):
+    with pytest.raises(ValueError, match="training scenes, but the paper's protocol compares 1,000; use --scale mini"):
         count_poses(replace(config, scale="paper"))
 
 
@@ -102,9 +102,30 @@ def test_impossible_options_are_refused(tmp_path):
         check_options(Av2("/data", transformers=("b", "xl")))
     with pytest.raises(ValueError, match="expected different sizes"):
         check_options(Kitti360("/data", transformers=("b", "b")))
+    with pytest.raises(ValueError, match="--ablations: the paper has these rows only for KITTI-360"):
+        check_options(Av2("/data", ablations=True))
+    for name, value in (("num_workers", 0), ("lvae_steps", 0), ("num_scenes", -1)):
+        with pytest.raises(ValueError, match=rf"--{name.replace('_', '-')} is {value}, expected 1 or more"):
+            check_options(Kitti360("/data", **{name: value}))
+    with pytest.raises(ValueError, match="there are 3 test scenes, but the evaluation needs at least 4"):
+        check_counts(Kitti360("/data", scale="mini"), Counts(50, 3))
     huge = [replace(stage, gigabytes=1e9) for stage in make_plan(PLANS[0], FULL)]
     with pytest.raises(ValueError, match="choose another --output"):
         require_space(huge, str(tmp_path / "new"))
+
+
+def test_run_in_the_directory_of_the_other_scale_is_refused(tmp_path):
+    (tmp_path / "scale.json").write_text('{"scale": "mini"}')
+    guard_scale(Kitti360("/data", scale="mini"), str(tmp_path))
+    with pytest.raises(ValueError, match="holds a run with --scale mini; choose another --output"):
+        guard_scale(Kitti360("/data"), str(tmp_path))
+
+
+def test_wrong_file_of_weights_is_found_before_the_first_stage(tmp_path):
+    (tmp_path / "w.pth").write_bytes(b"no weights")
+    for option in ("inception", "vgg16"):
+        with pytest.raises(ValueError, match=r"w\.pth"):
+            check_networks(Kitti360("/data", **{option: str(tmp_path / "w.pth")}))
 
 
 def make_scores(value: float) -> dict:
