@@ -73,11 +73,11 @@ def test_paper_fid_streams_all_training_scenes(data, tmp_path):
 
 
 def test_paper_nearest_computes_only_distances_of_vgg16(data, tmp_path, monkeypatch):
-    """Half of the generated scenes are training scenes; the test split is not used."""
+    """All generated pictures are copies of training scenes; the test split is not used."""
     weights = str(tmp_path / "vgg16.safetensors")
     shapes = {name: value.shape for name, value in VGG16().state_dict().items()}
     safetensors.numpy.save_file(random_state_dict(shapes), weights)
-    values = dict(PROTOCOLS["paper-nearest"].values) | {"max_scenes": 6}
+    values = dict(PROTOCOLS["paper-nearest"].values) | {"max_scenes": 32}
     small = replace(PROTOCOLS["paper-nearest"], values=values, num_generated=4)
     monkeypatch.setitem(PROTOCOLS, "paper-nearest", small)
     write_npz(str(tmp_path / "same.npz"), [render_scenes(data, 32)[[0, 1, 2, 3]]], 4)
@@ -87,8 +87,8 @@ def test_paper_nearest_computes_only_distances_of_vgg16(data, tmp_path, monkeypa
     with pytest.raises(ValueError, match="--controls conflicts with --protocol paper-nearest"):
         evaluate(replace(base, vgg16=weights, controls=True, output=str(tmp_path / "a")))
     found = evaluate(replace(base, vgg16=weights, output=str(tmp_path / "a")))["generation"]
-    assert set(found) == {"scenes", "memorisation", "protocol"} and found["scenes"] == {"real": 6, "generated": 4}
-    assert found["memorisation"]["real"]["mean"]["value"] > 0 and 0 < found["memorisation"]["copies"]["value"] <= 1
+    assert set(found) == {"scenes", "memorisation", "protocol"} and found["scenes"] == {"real": 32, "generated": 4}
+    assert found["memorisation"]["real"]["mean"]["value"] > 0 and found["memorisation"]["copies"]["value"] == 1
     assert "supplement G" in (tmp_path / "a/evaluation.html").read_text()
 
 
