@@ -82,14 +82,13 @@ def main(config: PaperConfig) -> None:
     require_gpus(config)
     storage.write_json({"scale": config.scale}, home_path("scale.json"))
     stages = Stages(home_path("stages.json"), total=len(plan) + 1)
-    first, *later = plan
+    first = plan[0]
     stages.run(first.name, lambda: RUN[first.job](first.config))
     # Preprocessing rejects scenes, and the sweeps of Argoverse 2 were estimated.
     scenes = Dataset.open(home_path("datasets", source)).scenes
     counts = Counts(scenes.get("train", 0), scenes.get("test", 0))
     check_counts(config, counts)
-    later = make_plan(config, counts)[1:]
-    for stage in later:
+    for stage in make_plan(config, counts)[1:]:
         stages.run(stage.name, lambda stage=stage: RUN[stage.job](stage.config))
     stages.run("write the tables", lambda: write_tables(config, stages.seconds))
 

@@ -490,11 +490,12 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
         cells.append(cell)
     note = (
         "Scores are given as mean (minimum to maximum) over seeds. Scenes are reconstructed from the latent mean. "
-        "GFLOP is the cost to encode and decode one scene. Minutes are those of the training with start-up and "
-        "validation. Recall: the share of primitives whose matched proposal has an existence probability above the "
-        "threshold and lies within 1 m. The centre error is the median distance between a primitive and its matched "
-        "proposal of any existence probability. The control decodes each scene from the latent of another scene. A "
-        "decoder that ignores the latent has the same error with both latents."
+        "GFLOP is the cost to encode and decode one scene. Minutes are those of the training steps. "
+        f"Recall and centre error are those of at most {ACCURACY_SCENES} scenes. Recall: the share of primitives whose "
+        "matched proposal has an existence probability above the threshold and lies within 1 m. The centre error is "
+        "the median distance between a primitive and its matched proposal of any existence probability. The control "
+        "decodes each scene from the latent of another scene. A decoder that ignores the latent has the same error "
+        "with both latents."
     )
     return Table("Variants of the layout VAE", columns, cells, note=note)
 
