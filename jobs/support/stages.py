@@ -27,7 +27,7 @@ class Stages:
 
         Args:
             name: Name of the stage.
-            work: Function that does the work. It is always called, and must return immediately if its results exist.
+            work: Function that does the work. It is always called, and must not repeat long work whose results exist.
                 The file keeps the longest duration of each stage.
 
         Returns:
@@ -37,7 +37,7 @@ class Stages:
         print(f"\n[{self.done}/{self.total}] {name}", flush=True)
         started = time.perf_counter()
         result = work()
-        # A completed stage returns immediately, so the longest duration is kept.
+        # A completed stage returns soon, so the longest duration is kept.
         self.seconds[name] = max(self.seconds.get(name, 0.0), time.perf_counter() - started)
         storage.write_json(self.seconds, self.path)
         return result
