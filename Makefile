@@ -32,7 +32,7 @@ demo: .venv/ready
 
 paper-kitti360 paper-av2: .venv/ready
 	@test -n "$(ROOT)" || { echo "error: give the directory of the dataset: make $@ ROOT=DIR" >&2; exit 2; }
-	$(BIN)/python jobs/reproduce_paper.py $(@:paper-%=%) --input "$(ROOT)" --output "runs/$@$(if $(findstring mini,$(ARGS)),-mini)" $(ARGS)
+	PRITTI_HOME="$(CURDIR)/runs" $(BIN)/python jobs/reproduce_paper.py $(@:paper-%=%) --input "$(ROOT)" $(ARGS)
 
 lint: .venv/ready
 	$(BIN)/ruff check .

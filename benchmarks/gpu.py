@@ -512,17 +512,20 @@ def measure_primitives(model: LayoutVAE, arrays: dict[str, torch.Tensor]) -> dic
     }
 
 
+def find_checkpoint(folder: Path) -> Path | None:
+    """Return the newest complete checkpoint under `folder`; the state is written last."""
+    found = [path.parent for path in folder.glob("step-*/state.json")]
+    return max(found, key=lambda path: int(path.name.removeprefix("step-")), default=None)
+
+
 def save_checkpoint(trainer: Trainer, folder: Path) -> None:
-    """Save a checkpoint under `folder`; the one before is removed after the new one is complete."""
-    folder.mkdir(parents=True, exist_ok=True)
-    new, old, current = folder / "new", folder / "old", folder / "checkpoint"
-    for path in (new, old):
-        shutil.rmtree(path, ignore_errors=True)
-    trainer.save(new)
-    if current.exists():
-        current.rename(old)
-    new.rename(current)
-    shutil.rmtree(old, ignore_errors=True)
+    """Save a checkpoint under `folder`, then remove all others."""
+    new = folder / f"step-{trainer.steps_done}"
+    if not (new / "state.json").exists():
+        trainer.save(new)
+    for path in folder.glob("step-*"):
+        if path != new:
+            shutil.rmtree(path)
 
 
 def run_learn(setup: Setup) -> Iterator[Row]:
@@ -533,8 +536,8 @@ def run_learn(setup: Setup) -> Iterator[Row]:
     layouts, steps, batch = Layouts(setup, setup.spec(preset)), setup.choose(setup.steps, 4), setup.choose(32, 2)
     trainer = make_lvae_for_training(setup, "auto", steps, layouts.draw(0, min(64, len(layouts))))
     folder = setup.output / "learn"
-    if (folder / "checkpoint/state.json").exists():
-        trainer.load(folder / "checkpoint")
+    if checkpoint := find_checkpoint(folder):
+        trainer.load(checkpoint)
     first, started, curve = trainer.steps_done, time.monotonic(), []
     saved = started
     while trainer.steps_done < steps and time.monotonic() - started < LEARN_SECONDS - 60:

@@ -62,7 +62,7 @@ PROTOCOLS: dict[str, Protocol] = {
         "distances to the nearest training scene as in the paper's supplement G: 50,000 training scenes, evenly spread,"
         " and 50,000 generated scenes, or all if there are fewer",
         COMMON | {"max_scenes": 50_000, "reference": "uniform"},
-        dict.fromkeys(("k", "peers", "inception", "ceiling_split"), ONLY_NEAREST),
+        dict.fromkeys(("k", "peers", "inception", "ceiling_split", "controls"), ONLY_NEAREST),
         num_generated=50_000,
         is_exact=False,
         only_nearest=True,
@@ -101,7 +101,7 @@ def apply_protocol(config: Config) -> Config:
         if given not in (None, (), value):
             _reject(config, name, f"which fixes {_spell(name)} {_format(value)}")
     for name, reason in protocol.unused.items():
-        if getattr(config, name) not in (None, (), ""):
+        if getattr(config, name) not in (None, (), "", False):
             _reject(config, name, f"which {reason}")
     for name, allowed in protocol.choices.items():
         if getattr(config, name) not in (None, *allowed):
@@ -112,8 +112,6 @@ def apply_protocol(config: Config) -> Config:
         _reject(config, "real", "which selects training scenes and needs a dataset directory")
     if config.ceiling_split == "halves":
         _reject(config, "ceiling_split", "which uses the whole training split as reference")
-    if protocol.only_nearest and config.controls:
-        raise ValueError(f"--controls conflicts with --protocol {config.protocol}, which {ONLY_NEAREST}")
     if protocol.only_nearest and not config.vgg16:
         raise ValueError(f"--protocol {config.protocol} needs VGG16 weights; add --vgg16 FILE")
     if protocol.is_streamed and config.inception and config.lite0:

@@ -44,6 +44,7 @@ from pipelines.reporting.paper_tables import Reproduced, build_paper_tables, com
 from pipelines.reporting.report import Table, Text, render_report_html
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
+from pipelines.schema.run_guard import find_changed_option
 from pipelines.schema.scene_subset import SceneSubset
 
 RUN: Mapping[str, Callable[[Any], Any]] = {
@@ -136,10 +137,8 @@ def guard_scale(config: PaperConfig, home: str) -> None:
     Raises:
         ValueError: The scales differ.
     """
-    path = storage.join_uri(home, "scale.json")
-    found = storage.read_json(path)["scale"] if storage.exists(path) else config.scale
-    if found != config.scale:
-        raise ValueError(f"{home} holds a run with --scale {found}; choose another --output")
+    if difference := find_changed_option(storage.join_uri(home, "scale.json"), {"scale": config.scale}):
+        raise ValueError(f"{home} holds a run with {difference}; choose another --output")
 
 
 def print_plan(plan: list[Stage], home: str) -> None:

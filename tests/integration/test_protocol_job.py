@@ -84,7 +84,7 @@ def test_paper_nearest_computes_only_distances_of_vgg16(data, tmp_path, monkeypa
     base = Config(real=data, generated=str(tmp_path / "same.npz"), protocol="paper-nearest", num_actors=1)
     with pytest.raises(ValueError, match="--protocol paper-nearest needs VGG16 weights; add --vgg16 FILE"):
         evaluate(replace(base, output=str(tmp_path / "a")))
-    with pytest.raises(ValueError, match="--controls conflicts with --protocol paper-nearest"):
+    with pytest.raises(ValueError, match="--controls True conflicts with --protocol paper-nearest"):
         evaluate(replace(base, vgg16=weights, controls=True, output=str(tmp_path / "a")))
     found = evaluate(replace(base, vgg16=weights, output=str(tmp_path / "a")))["generation"]
     assert set(found) == {"scenes", "memorisation", "protocol"} and found["scenes"] == {"real": 32, "generated": 4}

@@ -47,16 +47,15 @@ def test_rehearsal_needs_only_models_and_sections_merge(tmp_path):
     values = [row["value"] for section in results.values() for row in section["rows"]]
     assert np.isfinite(values).all() and min(values) >= 0
     assert (tmp_path / "learn/model/config.json").exists()
-    learned = json.loads((tmp_path / "learn/checkpoint/state.json").read_text())["steps_done"]
+    learned = gpu.find_checkpoint(tmp_path / "learn")
+    assert learned == tmp_path / "learn/step-4"
     again = run_isolated("--cpu", "--output", str(tmp_path), "--only", "train_dit", "learn")
     assert again.returncode == 0, again.stderr[-3000:]
     merged = json.loads((tmp_path / "gpu.json").read_text())
     assert {name: merged[name] for name in ("latency", "precision")} == {
         n: results[n] for n in ("latency", "precision")
     }
-    assert (
-        json.loads((tmp_path / "learn/checkpoint/state.json").read_text())["steps_done"] == learned
-    )  # All steps were done.
+    assert gpu.find_checkpoint(tmp_path / "learn") == learned  # All steps were done.
     table = (tmp_path / "gpu.md").read_text()
     rows = sum(len(section["rows"]) for section in merged.values())
     assert table.count("\n| tiny ") == rows
@@ -156,3 +155,12 @@ def test_scenes_of_a_file_are_held_out(tmp_path):
     drawn = layouts.draw(0, len(layouts))["features"]
     assert (len(layouts), len(held)) == (6, 2)
     assert not any(torch.equal(one, other) for one in held for other in drawn)
+
+
+def test_interrupted_checkpoint_is_ignored(tmp_path):
+    for step in (50, 100, 1000):
+        (tmp_path / f"step-{step}").mkdir()
+    assert gpu.find_checkpoint(tmp_path) is None
+    for step in (50, 100):
+        (tmp_path / f"step-{step}/state.json").touch()
+    assert gpu.find_checkpoint(tmp_path) == tmp_path / "step-100"

@@ -117,7 +117,7 @@ def test_impossible_options_are_refused(tmp_path):
 def test_run_in_the_directory_of_the_other_scale_is_refused(tmp_path):
     (tmp_path / "scale.json").write_text('{"scale": "mini"}')
     guard_scale(Kitti360("/data", scale="mini"), str(tmp_path))
-    with pytest.raises(ValueError, match="holds a run with --scale mini; choose another --output"):
+    with pytest.raises(ValueError, match='holds a run with scale="mini", asked for "paper"; choose another --output'):
         guard_scale(Kitti360("/data"), str(tmp_path))
 
 
@@ -186,4 +186,4 @@ def test_scores_are_found_by_path():
 def test_make_target_runs_the_job_with_its_arguments(name):
     words = ["make", "-n", f"paper-{name}", "ROOT=/data", "ARGS=--dry-run"]
     printed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    assert f'jobs/reproduce_paper.py {name} --input "/data" --output "runs/paper-{name}" --dry-run' in printed
+    assert f'/runs" .venv/bin/python jobs/reproduce_paper.py {name} --input "/data" --dry-run' in printed
