@@ -140,6 +140,7 @@ class PrITTIPipeline:
             noise_scaling=noise_scaling, existence_threshold=existence_threshold, neighbour_latents=neighbour_latents
         )
         self.execution = SamplingExecution()
+        self._denoiser: tuple[tuple, Denoiser] | None = None  # The last denoiser and what it depends on.
         self._progress_bar: dict[str, Any] = {}
         if dit.config.layout is not None:
             self.spec.require(LayoutSpec.from_dict(dit.config.layout), "the DiT")
@@ -433,6 +434,8 @@ class PrITTIPipeline:
     ) -> Denoiser:
         """Return the DiT with classifier-free guidance and precomputed modulations, run as `set_execution` says.
 
+        The last denoiser is kept, so batches with the same timesteps and labels share a CUDA graph.
+
         Args:
             timesteps: All timesteps that the denoiser will receive.
             label: Class index of each scene.
@@ -442,10 +445,17 @@ class PrITTIPipeline:
             Function that maps latents (b, c, h, w), timesteps (b,) and labels (b,) to noise.
         """
         null = self.dit.null_label
-        labels = label.tolist() if guidance_scale == 1.0 else [*label.tolist(), null]
+        labels = {*label.tolist()} if guidance_scale == 1.0 else {*label.tolist(), null}
+        # Changes of weights in place raise their version.
+        weights = tuple((weight.data_ptr(), weight._version) for weight in self.dit.parameters())
+        key = tuple(sorted({*timesteps.tolist()})), tuple(sorted(labels)), guidance_scale, self.execution, weights
+        if self._denoiser is not None and self._denoiser[0] == key:
+            return self._denoiser[1]
+        self._denoiser = None  # Free its memory first.
         with self.execution.autocast(self.device):
             model = with_guidance(self.dit.precompute_conditioning(timesteps.tolist(), labels), null, guidance_scale)
-        return self.execution.wrap(model, self.device)
+        self._denoiser = key, self.execution.wrap(model, self.device)
+        return self._denoiser[1]
 
     def resolve_noise_scaling(self, noise_scaling: float | None) -> float:
         """Return a noise scaling, or the default of the current sampler if the argument is None.

@@ -64,6 +64,26 @@ def test_replayed_denoiser_gives_equal_latents(monkeypatch):
     assert captured == [(3, *pipeline.latent_shape)] * 2  # once per sampling, not once per step
 
 
+def test_batches_share_a_denoiser_until_something_changes():
+    """Batches of a run share one CUDA graph; other labels, timesteps, options or weights need another one."""
+    pipeline = make_pipeline()
+    times, label = np.array([900, 500, 0]), torch.tensor([0, 1, 1])
+    first = pipeline.make_denoiser(times, label)
+    assert pipeline.make_denoiser(times, label.flip(0)) is first
+    assert pipeline.make_denoiser(times, label, 2.0) is not pipeline.make_denoiser(times, label)
+    assert pipeline.make_denoiser(times, label) is not pipeline.make_denoiser(times, torch.tensor([2]))
+    assert pipeline.make_denoiser(times, label) is not pipeline.make_denoiser(times[1:], label)
+    inputs = torch.randn(3, *pipeline.latent_shape), torch.tensor([500] * 3), label
+    before = pipeline.make_denoiser(times, label)(*inputs)
+    with torch.no_grad():
+        pipeline.dit.patch_out.bias.add_(1)
+    after = pipeline.make_denoiser(times, label)(*inputs)
+    assert not torch.allclose(after, before, atol=0.1) and torch.equal(after, pipeline.dit(*inputs))
+    last = pipeline.make_denoiser(times, label)
+    pipeline.set_execution(SamplingExecution(decode_batch_size=2))
+    assert pipeline.make_denoiser(times, label) is not last
+
+
 def test_each_shape_is_captured_once_and_results_are_kept():
     captured = []
 
