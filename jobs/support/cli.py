@@ -17,6 +17,7 @@ import tyro
 
 from jobs.support.log import JsonLines, use_log_format
 from jobs.support.renames import find_renamed
+from jobs.support.stopping import stop_on_sigterm
 
 # Environment variables that Ray reads at import and at start. Variables that the user has set keep their values.
 RAY_ENVIRONMENT = {
@@ -190,7 +191,8 @@ def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) ->
                 require_tracking_uri()
             if check := import_check(job):
                 check(config)
-            importlib.import_module(f"jobs.implementation.{job}").main(config)
+            with stop_on_sigterm():
+                importlib.import_module(f"jobs.implementation.{job}").main(config)
         except KeyboardInterrupt as error:
             print(f"{str(error) or 'interrupted'}; run the same command again to resume", file=sys.stderr)
             sys.exit(1)

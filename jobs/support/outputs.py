@@ -8,14 +8,13 @@ from __future__ import annotations
 import json
 import logging
 import os
-import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from types import FrameType
 
 from jobs.support.cli import home_path, read_positive_number
 from jobs.support.ray_session import start_ray
+from jobs.support.stopping import stop_job
 from models.uris import split_name
 from pipelines.runtime.resources import ResourcePolicy, set_resource_policy
 from pipelines.runtime.shared_storage import require_shared_storage
@@ -29,50 +28,12 @@ LIFETIME_VARIABLE = "PRITTI_LEASE_SECONDS"  # Time after which the lease of a si
 JOB_VARIABLE = "RAY_JOB_CONFIG_JSON_ENV_VAR"  # Ray sets this variable in submitted jobs.
 
 
-class JobStopped(KeyboardInterrupt):
-    """Raised in the main thread by SIGTERM (`ray job stop`) or by the loss of a lease; the message is the reason."""
-
-
 def find_job_id() -> str:
     """Return the submission id of this Ray job, or "" if the process was not submitted as a job."""
     try:
         return json.loads(os.environ.get(JOB_VARIABLE, "{}"))["metadata"]["job_submission_id"]
     except (ValueError, KeyError, TypeError):
         return ""
-
-
-@contextmanager
-def stop_on_sigterm() -> Iterator[None]:
-    """Raise JobStopped in the main thread when SIGTERM arrives. In other threads, this function does nothing."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    reason = ""
-
-    def stop(signum: int, frame: FrameType | None) -> None:
-        nonlocal reason
-        reason = _reasons.pop() if _reasons else "the job was stopped (SIGTERM)"
-        raise JobStopped(reason)
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        if reason and not isinstance(error, JobStopped):  # Ray Train raises another KeyboardInterrupt.
-            raise JobStopped(reason) from error
-        raise
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-_reasons: list[str] = []  # Reason for a SIGTERM that this process sends to itself.
-
-
-def _stop_job(message: str) -> None:
-    """Stop this job from another thread."""
-    _reasons.append(message)
-    os.kill(os.getpid(), signal.SIGTERM)
 
 
 @contextmanager
@@ -91,25 +52,19 @@ def hold_lease(output: str, name: str, if_busy: IfBusy = "refuse") -> Iterator[N
         ValueError: Another job writes to the output.
         OSError: The output cannot be written.
     """
-    with stop_on_sigterm():
-        lease = Lease(
-            output,
-            name,
-            Owner.of_this_process(find_job_id()),
-            _stop_job,
-            read_positive_number(LIFETIME_VARIABLE, LIFETIME_S),
-        )
-        lease.acquire(if_busy, lambda line: print(line, flush=True))
-        state = "failed"
-        try:
-            yield
-            state = "finished"
-        except KeyboardInterrupt:
-            state = "killed"
-            raise
-        finally:
-            with suppress(OSError):  # If the storage fails, the error of the body counts, and the lease expires.
-                lease.release(state)
+    lifetime_s = read_positive_number(LIFETIME_VARIABLE, LIFETIME_S)
+    lease = Lease(output, name, Owner.of_this_process(find_job_id()), stop_job, lifetime_s)
+    lease.acquire(if_busy, lambda line: print(line, flush=True))
+    state = "failed"
+    try:
+        yield
+        state = "finished"
+    except KeyboardInterrupt:
+        state = "killed"
+        raise
+    finally:
+        with suppress(OSError):  # If the storage fails, the error of the body counts, and the lease expires.
+            lease.release(state)
 
 
 @contextmanager
@@ -133,7 +88,7 @@ def watch_new_nodes(output: str, checked: set[str]) -> Iterator[None]:
             except ValueError as error:
                 failures += 1  # The storage of a node that has just started may need a moment.
                 if failures == NODE_ATTEMPTS and not done.is_set():
-                    _stop_job(str(error))
+                    stop_job(str(error))
                     return
             except Exception as error:  # The cluster or the storage does not answer; the job itself will notice.
                 logger.debug("new nodes were not checked: %s", error)

@@ -11,6 +11,7 @@ import ray.data
 from ray import cloudpickle
 
 from jobs.support.cli import set_ray_environment
+from jobs.support.stopping import keep_sigterm_handler
 
 
 def start_ray(training: bool = False, object_store_bytes: int | None = None) -> None:
@@ -27,7 +28,8 @@ def start_ray(training: bool = False, object_store_bytes: int | None = None) -> 
     store: dict[str, Any] = {} if os.environ.get("RAY_ADDRESS") else {"object_store_memory": object_store_bytes}
     # Without RAY_ADDRESS, Ray would join any cluster that somebody has started on this machine.
     address = os.environ.get("RAY_ADDRESS") or "local"
-    ray.init(address, logging_level=logging.WARNING, log_to_driver=True, include_dashboard=training, **store)
+    with keep_sigterm_handler():
+        ray.init(address, logging_level=logging.WARNING, log_to_driver=True, include_dashboard=training, **store)
     context = ray.data.DataContext.get_current()
     context.enable_progress_bars = False
     context.print_on_execution_start = False

@@ -14,12 +14,31 @@ from pipelines.preprocess.sources.town.generator import generate_town, write_kit
 SMALL = {"scale": "mini", "lvae-steps": 4, "dit-steps": 4, "num-scenes": 12, "num-inference-steps": 3}
 
 
-def reproduce(raw: Path, output: Path, *more: str) -> str:
+def start(raw: Path, output: Path, *more: str) -> subprocess.Popen[str]:
     words = [sys.executable, "jobs/reproduce_paper.py", "kitti360", "--input", raw, "--output", output, *more]
     words += [word for name, value in SMALL.items() for word in (f"--{name}", str(value))]
-    done = subprocess.run(words, cwd=ROOT, env=os.environ | {"PYTHONPATH": ""}, text=True, capture_output=True)
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
-    return done.stdout
+    env = os.environ | {"PYTHONPATH": "", "PYTHONUNBUFFERED": "1"}
+    return subprocess.Popen(words, cwd=ROOT, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+
+
+def reproduce(raw: Path, output: Path, *more: str) -> str:
+    process = start(raw, output, *more)
+    printed = process.communicate()[0]
+    assert process.returncode == 0, printed[-6000:]
+    return printed
+
+
+def stop_in(stage: str, raw: Path, output: Path) -> None:
+    """Stop the job as soon as it prints a text."""
+    process = start(raw, output)
+    assert process.stdout is not None and any(stage in line for line in process.stdout)
+    process.terminate()
+    assert "run the same command again to resume" in process.communicate()[0] and process.returncode != 0
+
+
+def read_times(output: Path) -> dict[Path, int]:
+    paths = [path for path in output.rglob("*") if path.suffix in (".safetensors", ".parquet")]
+    return {path: path.stat().st_mtime_ns for path in paths}
 
 
 def test_dry_run_prints_commands_and_writes_nothing(tmp_path):
@@ -30,10 +49,16 @@ def test_dry_run_prints_commands_and_writes_nothing(tmp_path):
 
 
 @pytest.mark.slow
-def test_rehearsal_writes_tables_and_second_call_repeats_nothing(tmp_path):
+def test_rehearsal_resumes_and_second_call_repeats_nothing(tmp_path):
     for seed in (3, 4):
         write_kitti360(generate_town(seed), tmp_path / "raw", seed=seed)
     output = tmp_path / "out"
+    stop_in("[1/8]", tmp_path / "raw", output)
+    stop_in("1 worker, from step 0", tmp_path / "raw", output)
+    tables = read_times(output / "datasets")
+    stop_in("[5/8]", tmp_path / "raw", output)
+    weights = read_times(output / "runs")
+    assert tables and weights
     assert "[8/8] write the tables" in reproduce(tmp_path / "raw", output)
     rows = {row["name"]: row for row in json.loads((output / "tables.json").read_text())}
     found = rows["AP3D (%)"]
@@ -42,9 +67,10 @@ def test_rehearsal_writes_tables_and_second_call_repeats_nothing(tmp_path):
     assert rows["FID, DiT-B"]["note"] == "needs --inception FILE" and 0.4 < classifier["ours"] <= 1
     assert "| AP3D (%) | 62.12 |" in (output / "tables.md").read_text()
     assert "rehearsal" in (output / "tables.html").read_text()
-    paths = [path for path in output.rglob("*") if path.suffix in (".safetensors", ".parquet")]
     again = {"metrics.parquet", "reconstruction.parquet", "diffusion_pytorch_model.safetensors"}  # Written at each end.
-    written = {path: path.stat().st_mtime_ns for path in paths if path.name not in again}
+    written = {path: time for path, time in read_times(output).items() if path.name not in again}
     assert len(written) > 20
+    assert tables.items() <= written.items()
+    assert {path: time for path, time in weights.items() if path.name not in again}.items() <= written.items()
     reproduce(tmp_path / "raw", output)
-    assert {path: path.stat().st_mtime_ns for path in written} == written
+    assert written.items() <= read_times(output).items()

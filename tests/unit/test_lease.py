@@ -122,10 +122,12 @@ def test_process_ids_are_recognised_after_reuse():
 
 
 def test_sigterm_stops_the_job_and_ends_its_lease_as_killed(tmp_path):
-    from jobs.support.outputs import JobStopped, hold_lease
+    from jobs.support.outputs import hold_lease
+    from jobs.support.stopping import JobStopped, stop_on_sigterm
 
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(JobStopped, match=r"the job was stopped \(SIGTERM\)"), hold_lease(str(tmp_path), "run"):
+    stopped = pytest.raises(JobStopped, match=r"the job was stopped \(SIGTERM\)")
+    with stopped, stop_on_sigterm(), hold_lease(str(tmp_path), "run"):
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(30)
     assert signal.getsignal(signal.SIGTERM) == before
