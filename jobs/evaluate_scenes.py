@@ -28,11 +28,11 @@ training scenes with as many generated scenes, only by distances of VGG16 featur
 50,000 generated scenes with training poses, and drops white pictures and pictures with a black pixel on both sides.
 
 The job writes metrics.json, metrics.parquet and evaluation.html, and logs all results to MLflow. With --lvae, the job
-also writes reconstruction.html (the best and the worst scenes) and reconstruction.parquet (one row per scene). FID,
-sFID, KID, IS, precision and recall need a local file of Inception weights. Without Inception weights, the job reports
-distances of layout statistics, of relations between objects and ground, and of features of EfficientNet-Lite0 (extra
-lite0) and of a fixed random network, under separate names. Run the same command
-again to resume after an interruption.
+also writes reconstruction.html (the best and the worst scenes), reconstruction.parquet (one row per scene) and
+limits.json: scores of the same scenes without a network, as they are and damaged. FID, sFID, KID, IS, precision and
+recall need a local file of Inception weights. Without Inception weights, the job reports distances of layout
+statistics, of relations between objects and ground, and of features of EfficientNet-Lite0 (extra lite0) and of a fixed
+random network, under separate names. Run the same command again to resume after an interruption.
 """
 
 from __future__ import annotations

@@ -33,10 +33,11 @@ from models.training import count_flops
 from models.vae.config import override_options
 from pipelines.evaluation import ablation
 from pipelines.evaluation.ablation import Variant
-from pipelines.evaluation.reconstruction import evaluate_reconstruction
+from pipelines.evaluation.reconstruction import evaluate_reconstruction, read_limits
 from pipelines.reporting.chart import Chart, make_standalone_svg
 from pipelines.reporting.report import Table
 from pipelines.runtime import storage
+from pipelines.schema.dataset import Dataset
 from pipelines.schema.run_guard import guard_options
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.training.latents import load_lvae
@@ -161,7 +162,7 @@ def compare_variants(config: Branches) -> str:
                 kept = {f"{make_slug(variant)}.{name}": scores[-1].get(name) for name in ablation.MEASURES}
                 tracker.metrics({name: value for name, value in kept.items() if value is not None}, seed)
         rows, curves = ablation.group_by_variant(scores), ablation.draw_curve_chart(scores)
-        table = ablation.build_variant_table(rows)
+        table = ablation.build_variant_table(rows, measure_limits(config, scores[0]["dataset"], output))
         write_tables(output, config.name, rows, [table], curves)
         is_timed = is_at_equal_time(config) and not config.steps
         equal = "the same training time" if is_timed else "the same number of steps"
@@ -169,6 +170,14 @@ def compare_variants(config: Branches) -> str:
         html = ablation.render_page("Ablations of the layout VAE", config.name, [table], [curves], how)
         write_page(output, html, [table], tracker)
         return output
+
+
+def measure_limits(config: Branches, root: str, output: str) -> dict[str, dict]:
+    """Return the scores of the ceiling and the control on the held-out scenes of a dataset."""
+    dataset = Dataset.open(root)
+    selection = SceneSubset(root, dataset.source, "test", config.max_scenes)
+    spec = dataset.spec.with_resolution(find_preset(LVAE_PRESETS, config.preset).raster_px)
+    return read_limits(selection, spec, storage.join_uri(output, "limits.json"))
 
 
 def select_variants(config: Branches) -> dict[str, Variant]:

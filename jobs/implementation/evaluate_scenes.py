@@ -38,7 +38,7 @@ from pipelines.evaluation.features import (
     count_scenes,
     drop_blank,
 )
-from pipelines.evaluation.reconstruction import draw_scenes, evaluate_reconstruction
+from pipelines.evaluation.reconstruction import draw_scenes, evaluate_reconstruction, read_limits, select_headlines
 from pipelines.evaluation.streamed import compare_streamed
 from pipelines.metrics.adm_npz import read_picture_shape, read_reference_moments
 from pipelines.metrics.controls import CONTROLS
@@ -404,6 +404,10 @@ def score_reconstruction(config: Config, dataset: Dataset, output: str, bar: Job
         on_scenes=lambda count: bar.advance(shown, count),
         label_threshold=read_existence_threshold(lvae),
     )
+    task = bar.add_task("score ceiling and control", total=1)
+    limits = read_limits(real, load_lvae(lvae).spec, storage.join_uri(output, "limits.json"), config.voxel_range_m)
+    bar.advance(task)
+    scores = rebuilt.scores | {"limits": {name: select_headlines(found) for name, found in limits.items()}}
     storage.write_parquet(rebuilt.scenes, storage.join_uri(output, "reconstruction.parquet"))
     count = min(config.num_examples, len(rebuilt.places) // 2)
     drawn = []
@@ -411,10 +415,10 @@ def score_reconstruction(config: Config, dataset: Dataset, output: str, bar: Job
         chosen = rebuilt.places[:count] + rebuilt.places[-count:]
         drawing = bar.add_task("draw best and worst", total=len(chosen))
         drawn = draw_scenes(chosen, lvae, config.num_actors, lambda: bar.advance(drawing))
-    subtitle = f"{lvae} on {rebuilt.scores['scenes']} scenes of {real.root}, split {real.split}"
-    html = render_reconstruction_html(rebuilt.scores, rebuilt.scenes, drawn[:count], drawn[count:][::-1], subtitle)
+    subtitle = f"{lvae} on {scores['scenes']} scenes of {real.root}, split {real.split}"
+    html = render_reconstruction_html(scores, rebuilt.scenes, drawn[:count], drawn[count:][::-1], subtitle)
     storage.write_text(html, storage.join_uri(output, "reconstruction.html"))
-    return rebuilt.scores
+    return scores
 
 
 def main(config: Config) -> None:

@@ -36,16 +36,13 @@ from jobs.support.outputs import hold_output
 from jobs.support.ray_session import start_ray
 from jobs.support.stages import Stages
 from jobs.support.terminal import print_table
-from models.presets import LVAE_PRESETS
 from models.uris import is_uri
 from pipelines.evaluation.features import load_cached_inception, load_cached_vgg16
-from pipelines.evaluation.reconstruction import score_limits
 from pipelines.reporting.paper_tables import Reproduced, build_paper_tables, compare_with_paper, format_paper_tables
 from pipelines.reporting.report import Table, Text, render_report_html
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.run_guard import find_changed_option
-from pipelines.schema.scene_subset import SceneSubset
 
 RUN: Mapping[str, Callable[[Any], Any]] = {
     "preprocess_scenes": preprocess_scenes.main,
@@ -239,16 +236,9 @@ def describe_run(config: PaperConfig) -> list[str]:
 
 
 def collect_scores(config: PaperConfig) -> Reproduced:
-    """Read the scores of all evaluations, and score the ceiling and the control of the reconstruction."""
-    source = find_source(config)
-    data = home_path("datasets", source)
-    dataset = Dataset.open(data)
+    """Read the scores of all evaluations."""
     ours = storage.read_json(home_path("evaluations", "reconstruction", "metrics.json"))["reconstruction"]
-    path = home_path("evaluations", "reconstruction", "limits.json")
-    if not storage.exists(path):
-        subset = SceneSubset(data, dataset.source, "test")
-        spec = dataset.spec.with_resolution(LVAE_PRESETS[find_presets(config, "b")[0]].raster_px)
-        storage.write_json(score_limits(subset, spec), path)
+    limits = storage.read_json(home_path("evaluations", "reconstruction", "limits.json"))["scores"]
     study = home_path("ablations", "branches", "branches.json")
     if storage.exists(study):
         ours |= {"ablation": {row["variant"]: row for row in storage.read_json(study)["rows"]}}
@@ -283,7 +273,7 @@ def collect_scores(config: PaperConfig) -> Reproduced:
             scores |= {name: value for name, value in compared.items() if name == "memorisation"}
             notes |= describe_memorisation(compared)
         generation[size] = scores
-    return Reproduced({"ours": ours} | storage.read_json(path), generation, notes)
+    return Reproduced({"ours": ours} | limits, generation, notes)
 
 
 def list_evaluated_sizes(config: PaperConfig) -> list[str]:

@@ -462,7 +462,16 @@ def build_yaw_table(rows: Sequence[dict]) -> Table:
     return Table("IoU3D loss by yaw error", columns, cells, note=note)
 
 
-def build_variant_table(rows: Sequence[dict]) -> Table:
+def build_variant_table(rows: Sequence[dict], limits: Mapping[str, Mapping]) -> Table:
+    """Make the table of variants.
+
+    Args:
+        rows: Rows of `group_by_variant`.
+        limits: Scores of the ceiling and of the control on the same scenes (`score_limits`), by name.
+
+    Returns:
+        The table; its last rows are the ceiling and the control.
+    """
     names = {
         "ground_iou": "ground IoU, %",
         "height_mse_normalised": "height MSE x 100",
@@ -488,6 +497,9 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
         if has_errors:
             cell.append(None if row[error] is None else f"{100 * row[error]:.0f} ({100 * row[control]:.0f})")
         cells.append(cell)
+    for name, found in limits.items():
+        known = {key: None if found.get(key) is None else f"{100 * found[key]:.3g}" for key in names}
+        cells.append([f"{name}, no network", *[None] * 5, *known.values(), *[None] * has_errors])
     note = (
         "Scores are given as mean (minimum to maximum) over seeds. Scenes are reconstructed from the latent mean. "
         "GFLOP is the cost to encode and decode one scene. Minutes are those of the training steps. "
@@ -495,7 +507,8 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
         "matched proposal has an existence probability above the threshold and lies within 1 m. The centre error is "
         "the median distance between a primitive and its matched proposal of any existence probability. The control "
         "decodes each scene from the latent of another scene. A decoder that ignores the latent has the same error "
-        "with both latents."
+        "with both latents. The last two rows encode the scenes as layouts and decode them without a network: as they "
+        "are (ceiling), and with objects moved by up to 4 m and the ground shifted by 4 m (control)."
     )
     return Table("Variants of the layout VAE", columns, cells, note=note)
 

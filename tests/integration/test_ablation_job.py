@@ -108,6 +108,8 @@ def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys)
         return described | select_measures(BRANCH_VARIANTS[variant], scores)
 
     monkeypatch.setattr(job, "train_variant", train_variant)
+    limits = {"ceiling": {"ap3d": 0.987, "ground_iou": 1.0}, "control": {"ap3d": 0.123, "ground_iou": 0.8}}
+    monkeypatch.setattr(job, "measure_limits", lambda config, root, output: limits)
     output = job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=2))
     assert trained == [(seed, variant) for seed in (0, 1) for variant in BRANCH_VARIANTS]
     job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=3))
@@ -123,6 +125,7 @@ def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys)
     assert rows["without ground"]["control_center_error_m_mean"] == 5.0
     printed = capsys.readouterr().out
     assert "without" in printed and "split" in printed and "40 (500)" in printed
+    assert "98.7" in printed and "12.3" in printed
     with pytest.raises(ValueError, match="holds a study with steps=7, asked for 8"):
         job.compare_variants(job.Branches(preset="smoke", steps=8, num_seeds=2))
     with pytest.raises(ValueError, match=r"--only-variants \['without sky'\]: expected some of \['full model'"):

@@ -10,6 +10,7 @@ from pipelines.evaluation.reconstruction import (
     draw_scenes,
     evaluate_reconstruction,
     score_limits,
+    select_headlines,
 )
 from pipelines.reporting.reconstruction_report import render_reconstruction_html
 from pipelines.schema.scene_subset import SceneSubset
@@ -70,7 +71,10 @@ def test_reconstruction_page_shows_truth_and_reconstruction(reconstruction_datas
             truth, again = row[f"truth_{view}"], row[f"rebuilt_{view}"]
             differs = bool((truth != again).any())
             assert truth.shape == again.shape == (480, 480, 3) and differs
-    html = render_reconstruction_html(reconstruction.scores, reconstruction.scenes, drawn[:1], drawn[1:])
+    limit = select_headlines(reconstruction.scores | {"ap3d": 0.987654})
+    scores = reconstruction.scores | {"limits": {"ceiling": limit, "control": limit | {"ap3d": 0.123456}}}
+    html = render_reconstruction_html(scores, reconstruction.scenes, drawn[:1], drawn[1:])
+    assert "0.9877" in html and "0.1235" in html
     counts = html.count("<img"), html.count('src="data:image/'), html.count("http")
     assert counts == (8, 8, 0)  # the page has no external links
     wanted = ("AP3D@50", "voxel mIoU", "Memory", "Content outside the voxel grid", "vegetation ellipsoid")
