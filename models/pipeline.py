@@ -104,6 +104,11 @@ def check_noise_scaling(noise_scaling: float) -> float:
     return noise_scaling
 
 
+def _get_version(weight: Tensor) -> int:
+    """Return a number that each change of a tensor in place raises. Tensors of the inference mode have none."""
+    return 0 if weight.is_inference() else weight._version
+
+
 class PrITTIPipeline:
     """Generate, inpaint and outpaint Scenes. Methods and file formats are similar to those of diffusers pipelines.
 
@@ -140,7 +145,8 @@ class PrITTIPipeline:
             noise_scaling=noise_scaling, existence_threshold=existence_threshold, neighbour_latents=neighbour_latents
         )
         self.execution = SamplingExecution()
-        self._denoiser: tuple[tuple, Denoiser] | None = None  # The last denoiser and what it depends on.
+        # What the last denoiser depends on, its labels, and the denoiser.
+        self._denoiser: tuple[tuple, set[int], Denoiser] | None = None
         self._progress_bar: dict[str, Any] = {}
         if dit.config.layout is not None:
             self.spec.require(LayoutSpec.from_dict(dit.config.layout), "the DiT")
@@ -434,7 +440,8 @@ class PrITTIPipeline:
     ) -> Denoiser:
         """Return the DiT with classifier-free guidance and precomputed modulations, run as `set_execution` says.
 
-        The last denoiser is kept, so batches with the same timesteps and labels share a CUDA graph.
+        The last denoiser is kept for batches with the same timesteps, so they share a CUDA graph. It is made again if a
+        batch has a new label, or if weights change; changes through `weight.data` are not noticed.
 
         Args:
             timesteps: All timesteps that the denoiser will receive.
@@ -446,16 +453,17 @@ class PrITTIPipeline:
         """
         null = self.dit.null_label
         labels = {*label.tolist()} if guidance_scale == 1.0 else {*label.tolist(), null}
-        # Changes of weights in place raise their version.
-        weights = tuple((weight.data_ptr(), weight._version) for weight in self.dit.parameters())
-        key = tuple(sorted({*timesteps.tolist()})), tuple(sorted(labels)), guidance_scale, self.execution, weights
+        weights = tuple((weight.data_ptr(), _get_version(weight)) for weight in self.dit.parameters())
+        key = tuple(sorted({*timesteps.tolist()})), guidance_scale, self.execution, weights
         if self._denoiser is not None and self._denoiser[0] == key:
-            return self._denoiser[1]
-        self._denoiser = None  # Free its memory first.
+            if labels <= self._denoiser[1]:
+                return self._denoiser[2]
+            labels |= self._denoiser[1]
+        self._denoiser = None  # Free the old graph before the next capture.
         with self.execution.autocast(self.device):
             model = with_guidance(self.dit.precompute_conditioning(timesteps.tolist(), labels), null, guidance_scale)
-        self._denoiser = key, self.execution.wrap(model, self.device)
-        return self._denoiser[1]
+        self._denoiser = key, labels, self.execution.wrap(model, self.device)
+        return self._denoiser[2]
 
     def resolve_noise_scaling(self, noise_scaling: float | None) -> float:
         """Return a noise scaling, or the default of the current sampler if the argument is None.

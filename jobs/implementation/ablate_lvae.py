@@ -33,7 +33,7 @@ from models.training import count_flops
 from models.vae.config import override_options
 from pipelines.evaluation import ablation
 from pipelines.evaluation.ablation import Variant
-from pipelines.evaluation.reconstruction import evaluate_reconstruction, read_limits
+from pipelines.evaluation.reconstruction import evaluate_reconstruction, score_limits
 from pipelines.reporting.chart import Chart, make_standalone_svg
 from pipelines.reporting.report import Table
 from pipelines.runtime import storage
@@ -177,7 +177,7 @@ def measure_limits(config: Branches, root: str, output: str) -> dict[str, dict]:
     dataset = Dataset.open(root)
     selection = SceneSubset(root, dataset.source, "test", config.max_scenes)
     spec = dataset.spec.with_resolution(find_preset(LVAE_PRESETS, config.preset).raster_px)
-    return read_limits(selection, spec, storage.join_uri(output, "limits.json"))
+    return score_limits(selection, spec, storage.join_uri(output, "limits"))
 
 
 def select_variants(config: Branches) -> dict[str, Variant]:

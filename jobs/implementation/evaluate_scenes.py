@@ -38,7 +38,7 @@ from pipelines.evaluation.features import (
     count_scenes,
     drop_blank,
 )
-from pipelines.evaluation.reconstruction import draw_scenes, evaluate_reconstruction, read_limits, select_headlines
+from pipelines.evaluation.reconstruction import draw_scenes, evaluate_reconstruction, score_limits
 from pipelines.evaluation.streamed import compare_streamed
 from pipelines.metrics.adm_npz import read_picture_shape, read_reference_moments
 from pipelines.metrics.controls import CONTROLS
@@ -47,7 +47,7 @@ from pipelines.metrics.inception_score import compute_streamed_inception_score
 from pipelines.metrics.lite0 import describe_lite0
 from pipelines.metrics.vgg16 import describe_vgg16
 from pipelines.reporting.evaluation_report import ExamplePictures, format_value, list_headlines, render_evaluation_html
-from pipelines.reporting.reconstruction_report import render_reconstruction_html
+from pipelines.reporting.reconstruction_report import render_reconstruction_html, select_overall_scores
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.scene_subset import Pick, SceneSubset
@@ -404,10 +404,16 @@ def score_reconstruction(config: Config, dataset: Dataset, output: str, bar: Job
         on_scenes=lambda count: bar.advance(shown, count),
         label_threshold=read_existence_threshold(lvae),
     )
-    task = bar.add_task("score ceiling and control", total=1)
-    limits = read_limits(real, load_lvae(lvae).spec, storage.join_uri(output, "limits.json"), config.voxel_range_m)
-    bar.advance(task)
-    scores = rebuilt.scores | {"limits": {name: select_headlines(found) for name, found in limits.items()}}
+    task = bar.add_task("score ceiling and control", total=rebuilt.scores["scenes"])
+    limits = score_limits(
+        real,
+        load_lvae(lvae).spec,
+        storage.join_uri(output, "limits"),
+        config.voxel_range_m,
+        lambda count: bar.advance(task, count),
+    )
+    storage.write_json(limits, storage.join_uri(output, "limits.json"))
+    scores = rebuilt.scores | {"limits": {name: select_overall_scores(found) for name, found in limits.items()}}
     storage.write_parquet(rebuilt.scenes, storage.join_uri(output, "reconstruction.parquet"))
     count = min(config.num_examples, len(rebuilt.places) // 2)
     drawn = []

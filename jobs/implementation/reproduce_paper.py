@@ -38,6 +38,7 @@ from jobs.support.stages import Stages
 from jobs.support.terminal import print_table
 from models.uris import is_uri
 from pipelines.evaluation.features import load_cached_inception, load_cached_vgg16
+from pipelines.metrics.controls import MOVE_M, RECONSTRUCTION_CONTROL
 from pipelines.reporting.paper_tables import Reproduced, build_paper_tables, compare_with_paper, format_paper_tables
 from pipelines.reporting.report import Table, Text, render_report_html
 from pipelines.runtime import storage
@@ -54,7 +55,6 @@ RUN: Mapping[str, Callable[[Any], Any]] = {
     "evaluate_scenes": evaluate,
 }
 GIGABYTE = 1e9
-CONTROL = "objects moved by up to 4 m"
 
 
 def main(config: PaperConfig) -> None:
@@ -224,9 +224,9 @@ def describe_run(config: PaperConfig) -> list[str]:
     described = [
         f"Dataset {source}: {make_absolute(config.input)}, {dataset.spec.num_slots} slots per scene.",
         f"Presets {', '.join(presets)}; seed {config.seed}.",
-        "The ceiling of a reconstruction is the scene encoded as a layout and decoded again without a network; its"
-        f" control also has {CONTROL} and the ground shifted by 4 m. The ceiling of a generation score is the score of"
-        f" other real scenes, its control that of real scenes with {CONTROL}.",
+        "The ceiling of a reconstruction converts the scenes to layout tensors and back, without a network; its control"
+        f" does the same with {RECONSTRUCTION_CONTROL}. The ceiling of a generation score is the score of other real"
+        f" scenes, its control that of real scenes with objects moved by up to {MOVE_M:g} m.",
     ]
     if config.ablations:
         described.append("The ablations of the layout VAE have seed 0.")
@@ -238,7 +238,7 @@ def describe_run(config: PaperConfig) -> list[str]:
 def collect_scores(config: PaperConfig) -> Reproduced:
     """Read the scores of all evaluations."""
     ours = storage.read_json(home_path("evaluations", "reconstruction", "metrics.json"))["reconstruction"]
-    limits = storage.read_json(home_path("evaluations", "reconstruction", "limits.json"))["scores"]
+    limits = storage.read_json(home_path("evaluations", "reconstruction", "limits.json"))
     study = home_path("ablations", "branches", "branches.json")
     if storage.exists(study):
         ours |= {"ablation": {row["variant"]: row for row in storage.read_json(study)["rows"]}}

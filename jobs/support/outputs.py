@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 
 from jobs.support.cli import home_path, read_positive_number
 from jobs.support.ray_session import start_ray
-from jobs.support.stopping import stop_job
+from jobs.support.stopping import stop_job, stop_on_sigterm
 from models.uris import split_name
 from pipelines.runtime.resources import ResourcePolicy, set_resource_policy
 from pipelines.runtime.shared_storage import require_shared_storage
@@ -54,17 +54,18 @@ def hold_lease(output: str, name: str, if_busy: IfBusy = "refuse") -> Iterator[N
     """
     lifetime_s = read_positive_number(LIFETIME_VARIABLE, LIFETIME_S)
     lease = Lease(output, name, Owner.of_this_process(find_job_id()), stop_job, lifetime_s)
-    lease.acquire(if_busy, lambda line: print(line, flush=True))
-    state = "failed"
-    try:
-        yield
-        state = "finished"
-    except KeyboardInterrupt:
-        state = "killed"
-        raise
-    finally:
-        with suppress(OSError):  # If the storage fails, the error of the body counts, and the lease expires.
-            lease.release(state)
+    with stop_on_sigterm():
+        lease.acquire(if_busy, lambda line: print(line, flush=True))
+        state = "failed"
+        try:
+            yield
+            state = "finished"
+        except KeyboardInterrupt:
+            state = "killed"
+            raise
+        finally:
+            with suppress(OSError):  # If the storage fails, the error of the body counts, and the lease expires.
+                lease.release(state)
 
 
 @contextmanager

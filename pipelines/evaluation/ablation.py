@@ -31,6 +31,7 @@ from models.studies.orientation_study import (
 )
 from models.tensors import make_layout_batch
 from models.vae.accuracy import Accuracy, compute_accuracy, join_pairs, pair_primitives
+from pipelines.metrics.controls import RECONSTRUCTION_CONTROL
 from pipelines.reporting.chart import Chart, draw_chart_svg
 from pipelines.reporting.drawings_page import CaptionedSvg, DrawingsSection, render_page_html
 from pipelines.reporting.report import Table, Text
@@ -507,8 +508,8 @@ def build_variant_table(rows: Sequence[dict], limits: Mapping[str, Mapping]) -> 
         "matched proposal has an existence probability above the threshold and lies within 1 m. The centre error is "
         "the median distance between a primitive and its matched proposal of any existence probability. The control "
         "decodes each scene from the latent of another scene. A decoder that ignores the latent has the same error "
-        "with both latents. The last two rows encode the scenes as layouts and decode them without a network: as they "
-        "are (ceiling), and with objects moved by up to 4 m and the ground shifted by 4 m (control)."
+        "with both latents. The last two rows need no network: the ceiling converts each scene to layout tensors and "
+        f"back; the control does the same with {RECONSTRUCTION_CONTROL}."
     )
     return Table("Variants of the layout VAE", columns, cells, note=note)
 

@@ -5,12 +5,10 @@ The graph writes one record per scene. Records can be added, and one task comput
 
 from __future__ import annotations
 
-import json
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
-from operator import itemgetter
 
 import numpy as np
 import pyarrow as pa
@@ -24,8 +22,9 @@ from models.scene import CATEGORIES, Scene
 from models.tensors import EXISTENCE_THRESHOLD, DecodedLayout, decode_layout, make_layout_batch, resample_scene_ground
 from pipelines.evaluation.features import READER_CPUS, judge_labels
 from pipelines.geometry.voxels import NUM_CLASSES, OutsideCounts, VoxelGrid, count_outside, voxelize
-from pipelines.metrics.controls import damage_scene
+from pipelines.metrics.controls import RECONSTRUCTION_CONTROL, damage_scene
 from pipelines.metrics.reconstruction import (
+    LIMITS,
     MAX_DETECTIONS,
     MEMORY,
     SCORED,
@@ -68,18 +67,6 @@ AP_VARIANTS = {
 VOXEL_PX = 256  # Paper, Tab. 1.
 VOXEL_RANGE_M = (VoxelGrid.bottom_m, VoxelGrid.top_m)
 PICTURE_PX = 480
-# Scores that have a ceiling and a control in tables; `select_headlines` adds some of boxes and of voxels.
-HEADLINES = (
-    "scenes",
-    "ground_iou",
-    "raster_ground_iou",
-    "height_mae_m",
-    "height_rmse_m",
-    "height_mse_normalised",
-    "ap3d",
-    "ap3d_50",
-    "ap3d_ranked",
-)
 RECORDS_VERSION = 1  # Version of the records; files with another version are computed again.
 SCENE_SCORES = pa.schema(
     [("scene_id", pa.string()), ("primitives", pa.int64()), ("rebuilt_primitives", pa.int64())]
@@ -471,82 +458,67 @@ def compute_reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, 
 
 
 def score_limits(
-    scenes: SceneSubset, spec: LayoutSpec, voxel_range_m: tuple[float, float] = VOXEL_RANGE_M
+    selection: SceneSubset,
+    spec: LayoutSpec,
+    directory: str,
+    voxel_range_m: tuple[float, float] = VOXEL_RANGE_M,
+    on_scenes: Callable[[int], None] | None = None,
 ) -> dict[str, dict]:
     """Score the ceiling and the control of the reconstruction, without a network.
 
-    The ceiling encodes each scene to a layout and back. It loses objects without a slot, the part of centres and
+    The ceiling converts each scene to layout tensors and back. It loses objects without a slot, the part of centres and
     Cholesky parameters outside the bounds, and detail below the resolution. Heights are not clipped. The control does
-    the same with a damaged copy of the scene: each object moves by up to 4 m, and the ground is shifted by 4 m
-    (pipelines.metrics.controls).
+    the same with a damaged copy of the scene (RECONSTRUCTION_CONTROL). Tasks write records to files. To resume, call
+    this function again.
 
     Args:
-        scenes: Scenes to score.
+        selection: Scenes to score.
         spec: Layout of the model.
+        directory: Directory for the records. Files that belong to other scenes or options are deleted.
         voxel_range_m: Lowest and highest z of the voxels (m).
+        on_scenes: Called with the number of scenes of each finished chunk.
 
     Returns:
         Scores as those of `evaluate_reconstruction`, by the names "ceiling" and "control".
     """
-    voxels = make_voxel_grid(spec, voxel_range_m)
-
-    def score_scenes(item: tuple[int, Chunk]) -> tuple[int, dict[str, list[SceneRecord]]]:
-        place, (shard, rows) = item
-        found: dict[str, list[SceneRecord]] = {"ceiling": [], "control": []}
-        for number, scene in zip(rows, shard.scenes(rows), strict=True):
-            moved = damage_scene("moved", scene, scene, (shard.number, number))
-            damaged = damage_scene("ground_shifted", moved, moved, (shard.number, number))
-            for name, source in (("ceiling", scene), ("control", damaged)):
-                layout = represent_scene(source, spec)
-                latent = np.zeros((1, 1, 1), np.float32)
-                found[name].append(make_scene_record(scene, layout, latent, spec, voxels))
-        return place, found
-
-    chunks = list(enumerate(split_chunks(scenes, SCENES_PER_TASK)))
-    parts = [found for _, found in sorted(map_tasks(score_scenes, chunks), key=itemgetter(0))]
-    return {
-        name: compute_reconstruction_scores([record for part in parts for record in part[name]], spec, voxels)
-        for name in ("ceiling", "control")
+    voxels, chunks = make_voxel_grid(spec, voxel_range_m), split_chunks(selection, SCENES_PER_TASK)
+    inputs = {"layout": spec.fingerprint(), "voxel_range_m": list(voxel_range_m), "control": RECONSTRUCTION_CONTROL}
+    guard_options(
+        storage.join_uri(directory, "records.json"),
+        inputs | {"version": RECORDS_VERSION, "selection": asdict(selection), "files": selection.files()},
+        is_in_use=lambda: False,
+        discard=lambda: storage.delete_directory(directory),
+        describe=str,
+    )
+    paths = {
+        name: [make_records_path(storage.join_uri(directory, name), number) for number in range(len(chunks))]
+        for name in LIMITS
     }
+    promised = {of[number]: len(rows) for of in paths.values() for number, (_, rows) in enumerate(chunks)}
+    faulty = storage.find_faulty_files(promised)
+    missing = [number for number in range(len(chunks)) if any(of[number] in faulty for of in paths.values())]
+    if on_scenes:
+        on_scenes(sum(len(rows) for number, (_, rows) in enumerate(chunks) if number not in missing))
 
+    def score_scenes(number: int) -> int:
+        shard, rows = chunks[number]
+        found: dict[str, list[dict]] = {name: [] for name in LIMITS}
+        for row, scene in zip(rows, shard.scenes(rows), strict=True):
+            moved = damage_scene("moved", scene, scene, (shard.number, row))
+            damaged = damage_scene("ground_shifted", moved, moved, (shard.number, row))
+            for name, source in zip(LIMITS, (scene, damaged), strict=True):
+                record = make_scene_record(scene, represent_scene(source, spec), np.zeros((1, 1, 1)), spec, voxels)
+                found[name].append({"row": row, "scene_id": scene.scene_id} | record.to_row())
+        for name, records in found.items():
+            storage.write_parquet(pa.Table.from_pylist(records), paths[name][number])
+        return len(rows)
 
-def select_headlines(scores: Mapping) -> dict:
-    """Return the scores of the whole set, without those of categories, of classes and of the latent.
-
-    Args:
-        scores: Scores of a ceiling or a control (`score_limits`).
-
-    Returns:
-        The scores by the same names.
-    """
-    voxels, matched = scores["voxels"], scores["matched"]
-    return {name: scores[name] for name in HEADLINES} | {
-        "matched": {name: matched[name] for name in ("mean_iou3d", "found", "right")},
-        "voxels": {name: voxels[name] for name in ("iou", "miou")},
-    }
-
-
-def read_limits(
-    scenes: SceneSubset, spec: LayoutSpec, path: str, voxel_range_m: tuple[float, float] = VOXEL_RANGE_M
-) -> dict[str, dict]:
-    """Return the scores of `score_limits` from a file, or compute them and write the file.
-
-    Args:
-        scenes: Scenes to score.
-        spec: Layout of the model.
-        path: JSON file. If it belongs to other scenes or options, it is replaced.
-        voxel_range_m: Lowest and highest z of the voxels (m).
-
-    Returns:
-        Scores by the names "ceiling" and "control".
-    """
-    inputs = {"version": RECORDS_VERSION, "layout": spec.fingerprint(), "voxel_range_m": list(voxel_range_m)}
-    inputs |= {"selection": asdict(scenes), "files": scenes.files()}
-    if storage.exists(path) and (found := storage.read_json(path)).get("inputs") == json.loads(json.dumps(inputs)):
-        return found["scores"]
-    scores = score_limits(scenes, spec, voxel_range_m)
-    storage.write_json({"inputs": inputs, "scores": scores}, path)
-    return scores
+    for count in map_tasks(score_scenes, missing):
+        if on_scenes:
+            on_scenes(count)
+    storage.require_rows(promised)
+    merged = ray.get([merge_records.remote(paths[name], spec, voxels) for name in LIMITS])
+    return {name: scores for name, (scores, _, _) in zip(LIMITS, merged, strict=True)}
 
 
 def represent_scene(scene: Scene, spec: LayoutSpec) -> DecodedLayout:

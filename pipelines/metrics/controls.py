@@ -19,6 +19,8 @@ TURN_RAD = np.pi / 4
 DROP_SHARE, DUPLICATE_SHARE = 0.3, 0.1
 DUPLICATE_M = 0.25  # Distance between an object and its duplicate.
 GROUND_SHIFT_M = 4.0
+# Damage of the control of reconstructions.
+RECONSTRUCTION_CONTROL = f"objects moved by up to {MOVE_M:g} m and the ground shifted by {GROUND_SHIFT_M:g} m"
 ROUGH_AMPLITUDE_M, ROUGH_PERIOD_M = 0.5, 2.0
 INSET_M = 0.01  # Minimum distance of a clipped centre from the border of the grid.
 

@@ -24,6 +24,7 @@ from pipelines.schema.palette import CLASS_ID, EMPTY
 
 THRESHOLDS = np.linspace(0.05, 0.50, 10)  # The ten IoU3D thresholds of Omni3D.
 RECALL_POINTS = np.linspace(0.0, 1.0, 101)
+LIMITS = ("ceiling", "control")  # Scores without a network that stand next to those of a model.
 MAX_DETECTIONS = 100  # Maximum number of detections per scene and category, as in Omni3D.
 SCORED = tuple(c for c in range(len(CATEGORIES)) if c != ELLIPSOID)  # The paper does not score ellipsoids.
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from models.scene import CATEGORIES, GROUND_CLASSES
 from models.tensors import EXISTENCE_THRESHOLD
-from pipelines.metrics.reconstruction import MAX_DETECTIONS
+from pipelines.metrics.controls import RECONSTRUCTION_CONTROL
+from pipelines.metrics.reconstruction import LIMITS, MAX_DETECTIONS
 from pipelines.reporting.chart import Chart
 from pipelines.reporting.dataset_charts import spell_name
 from pipelines.reporting.report import Charts, Figure, KeyFigures, Picture, Pictures, Table, Text, render_report_html
@@ -21,10 +23,30 @@ PAPER = {
     "height_mse_normalised": 0.0075,
     "ap3d": 0.6212,
     "ap3d_50": 0.4696,
-    "voxel_iou": 0.9058,
-    "voxel_miou": 0.7027,
+    "voxels.iou": 0.9058,
+    "voxels.miou": 0.7027,
     "MiB": 2.52,
 }
+# Names of the scores of all scenes, by their paths.
+OVERALL = {
+    "ground_iou": "ground IoU",
+    "raster_ground_iou": "ground IoU, model resolution",
+    "height_rmse_m": "height RMSE, m",
+    "ground_outside_bounds": "ground outside the bounds",
+    "objects_outside_bounds": "objects outside the bounds",
+    "height_mae_m": "height MAE, m",
+    "height_mse_normalised": "height MSE, normalised",
+    "ap3d": "AP3D",
+    "ap3d_50": "AP3D@50",
+    "ap3d_ranked": "AP3D, ranked",
+    "matched.mean_iou3d": "mean IoU3D",
+    "matched.found": "found",
+    "matched.right": "right",
+    "voxels.iou": "voxel IoU",
+    "voxels.miou": "voxel mIoU",
+    "label_fidelity.joint_fidelity": "label fidelity",
+}
+OF_TRUTH = ("ground_outside_bounds", "objects_outside_bounds", "label_fidelity.joint_fidelity")
 VARIANTS = {
     "ranked": ("all", "unlimited"),
     "ranked_100": ("all", str(MAX_DETECTIONS)),
@@ -157,115 +179,76 @@ def draw_curves(scores: Mapping, scenes: pa.Table) -> Charts:
 
 
 def build_overall_table(scores: Mapping) -> Table:
-    voxels, matched, memory = scores["voxels"], scores["matched"], scores["memory_bytes"]
     bounds = scores["height_bounds_m"]
-    rows = [
-        (
-            "ground IoU",
-            scores["ground_iou"],
-            PAPER["ground_iou"],
-            "intersection over union of occupied pixels, summed over all classes, at the resolution of the true scene",
-        ),
-        (
-            "ground IoU, model resolution",
-            scores["raster_ground_iou"],
-            None,
-            f"ground IoU at the model resolution: the true scene is resampled to {scores['raster_px']} x "
-            f"{scores['raster_px']} pixels, and resampling errors are excluded",
-        ),
-        ("height RMSE, m", scores["height_rmse_m"], None, "over pixels that are occupied in the true scene"),
-        (
-            "ground outside the bounds",
-            scores["ground_outside_bounds"],
-            None,
-            "share of occupied pixels whose true height is outside the height bounds of this model, "
-            f"{bounds['low']:.2f} to {bounds['high']:.2f} m; the model saw no such heights in training",
-        ),
-        (
-            "objects outside the bounds",
-            scores["objects_outside_bounds"],
-            None,
-            "share of true objects with a centre height or a Cholesky parameter outside the bounds of this model; "
-            "these values are clipped before encoding",
-        ),
-        ("height MAE, m", scores["height_mae_m"], None, "over pixels that are occupied in the true scene"),
-        (
-            "height MSE, normalised",
-            scores["height_mse_normalised"],
-            PAPER["height_mse_normalised"],
-            f"heights scaled to [0, 1] by the bounds of this model, {bounds['low']:.2f} to {bounds['high']:.2f} m; the "
-            "paper does not state its bounds",
-        ),
-        (
-            "AP3D",
-            scores["ap3d"],
-            PAPER["ap3d"],
-            "mean over categories and ten IoU3D thresholds, 0.05 to 0.50, of the proposals above the paper's existence "
-            "threshold of 0.3",
-        ),
-        ("AP3D@50", scores["ap3d_50"], PAPER["ap3d_50"], "mean over categories at the IoU3D threshold 0.50"),
-        ("AP3D, ranked", scores["ap3d_ranked"], None, "the same over all proposals, ranked by existence probability"),
-        ("mean IoU3D", matched["mean_iou3d"], None, "over matched pairs of boxes"),
-        (
-            "found",
-            matched["found"],
-            None,
-            "share of true boxes that are matched with an overlapping reconstructed box",
-        ),
-        (
-            "right",
-            matched["right"],
-            None,
-            "share of reconstructed boxes that are matched with an overlapping true box",
-        ),
-        ("voxel IoU", voxels["iou"], PAPER["voxel_iou"], "filled against empty voxels"),
-        ("voxel mIoU", voxels["miou"], PAPER["voxel_miou"], "mean over all classes except the empty class"),
-        (
-            "label fidelity",
-            scores["label_fidelity"]["joint_fidelity"],
-            None,
-            "share of scenes whose reconstruction has both density labels of the true scene, with existence "
-            f"probabilities above {scores['label_existence_threshold']:g}; generated scenes can hardly reach a higher "
-            "share",
-        ),
-        (
-            "size, MiB",
-            (memory["rasters"] + memory["vectors"]) / MIB,
-            PAPER["MiB"],
-            f"tensors of one scene: rasters of {scores['raster_px']} x {scores['raster_px']} pixels and vectors; the "
-            "rasters of the paper have 256 x 256 pixels",
-        ),
+    meanings = {
+        "ground_iou": "intersection over union of occupied pixels, summed over all classes, at the resolution of the"
+        " true scene",
+        "raster_ground_iou": "ground IoU at the model resolution: the true scene is resampled to"
+        f" {scores['raster_px']} x {scores['raster_px']} pixels, and resampling errors are excluded",
+        "height_rmse_m": "over pixels that are occupied in the true scene",
+        "ground_outside_bounds": "share of occupied pixels whose true height is outside the height bounds of this"
+        f" model, {bounds['low']:.2f} to {bounds['high']:.2f} m; the model saw no such heights in training",
+        "objects_outside_bounds": "share of true objects with a centre height or a Cholesky parameter outside the"
+        " bounds of this model; these values are clipped before encoding",
+        "height_mae_m": "over pixels that are occupied in the true scene",
+        "height_mse_normalised": f"heights scaled to [0, 1] by the bounds of this model, {bounds['low']:.2f} to"
+        f" {bounds['high']:.2f} m; the paper does not state its bounds",
+        "ap3d": "mean over categories and ten IoU3D thresholds, 0.05 to 0.50, of the proposals above the paper's"
+        " existence threshold of 0.3",
+        "ap3d_50": "mean over categories at the IoU3D threshold 0.50",
+        "ap3d_ranked": "the same over all proposals, ranked by existence probability",
+        "matched.mean_iou3d": "over matched pairs of boxes",
+        "matched.found": "share of true boxes that are matched with an overlapping reconstructed box",
+        "matched.right": "share of reconstructed boxes that are matched with an overlapping true box",
+        "voxels.iou": "filled against empty voxels",
+        "voxels.miou": "mean over all classes except the empty class",
+        "label_fidelity.joint_fidelity": "share of scenes whose reconstruction has both density labels of the true"
+        f" scene, with existence probabilities above {scores['label_existence_threshold']:g}; generated scenes can"
+        " hardly reach a higher share",
+    }
+    limits = [scores["limits"][name] for name in LIMITS]
+    rows: list[tuple] = [
+        (OVERALL[path], find_score(scores, path), *(limit.get(path) for limit in limits), PAPER.get(path))
+        for path in meanings
     ]
-    limits = [build_limit_column(scores["limits"].get(name)) for name in ("ceiling", "control")]
+    memory = scores["memory_bytes"]
+    rows.append(("size, MiB", (memory["rasters"] + memory["vectors"]) / MIB, None, None, PAPER["MiB"]))
+    size = (
+        f"tensors of one scene: rasters of {scores['raster_px']} x {scores['raster_px']} pixels and vectors; the"
+        " rasters of the paper have 256 x 256 pixels"
+    )
     return Table(
         "Overall scores",
-        ("measure", "this model", "ceiling", "control", "paper, KITTI-360"),
-        [(name, ours, *(column.get(name) for column in limits), paper) for name, ours, paper, _ in rows],
-        meanings=[row[3] for row in rows],
-        note="The ceiling encodes each scene as a layout and decodes it without a network. The control does the same"
-        " with objects moved by up to 4 m and the ground shifted by 4 m.",
+        ("measure", "this model", *LIMITS, "paper, KITTI-360"),
+        rows,
+        meanings=[*meanings.values(), size],
+        note=f"The ceiling converts each scene to layout tensors and back, without a network. The control does the same"
+        f" with {RECONSTRUCTION_CONTROL}.",
     )
 
 
-def build_limit_column(limit: Mapping | None) -> dict[str, float]:
-    """Return the scores of a ceiling or a control by the names of the table of overall scores."""
-    if limit is None:
-        return {}
-    return {
-        "ground IoU": limit["ground_iou"],
-        "ground IoU, model resolution": limit["raster_ground_iou"],
-        "height RMSE, m": limit["height_rmse_m"],
-        "height MAE, m": limit["height_mae_m"],
-        "height MSE, normalised": limit["height_mse_normalised"],
-        "AP3D": limit["ap3d"],
-        "AP3D@50": limit["ap3d_50"],
-        "AP3D, ranked": limit["ap3d_ranked"],
-        "mean IoU3D": limit["matched"]["mean_iou3d"],
-        "found": limit["matched"]["found"],
-        "right": limit["matched"]["right"],
-        "voxel IoU": limit["voxels"]["iou"],
-        "voxel mIoU": limit["voxels"]["miou"],
-    }
+def find_score(scores: Mapping, path: str) -> Any:
+    """Return a score from nested scores.
+
+    Args:
+        scores: Nested scores.
+        path: Names from the outside to the inside, with dots between them.
+    """
+    for name in path.split("."):
+        scores = scores[name]
+    return scores
+
+
+def select_overall_scores(scores: Mapping) -> dict[str, float]:
+    """Return the scores of a ceiling or a control that the table of overall scores shows.
+
+    Args:
+        scores: Nested scores of `score_limits`.
+
+    Returns:
+        Scores by their paths, such as "matched.found". Scores that describe only the true scenes are left out.
+    """
+    return {path: find_score(scores, path) for path in OVERALL if path not in OF_TRUTH}
 
 
 def build_category_table(scores: Mapping) -> Table:

@@ -10,9 +10,8 @@ from pipelines.evaluation.reconstruction import (
     draw_scenes,
     evaluate_reconstruction,
     score_limits,
-    select_headlines,
 )
-from pipelines.reporting.reconstruction_report import render_reconstruction_html
+from pipelines.reporting.reconstruction_report import render_reconstruction_html, select_overall_scores
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.training.latents import load_lvae
 
@@ -71,7 +70,7 @@ def test_reconstruction_page_shows_truth_and_reconstruction(reconstruction_datas
             truth, again = row[f"truth_{view}"], row[f"rebuilt_{view}"]
             differs = bool((truth != again).any())
             assert truth.shape == again.shape == (480, 480, 3) and differs
-    limit = select_headlines(reconstruction.scores | {"ap3d": 0.987654})
+    limit = select_overall_scores(reconstruction.scores) | {"ap3d": 0.987654}
     scores = reconstruction.scores | {"limits": {"ceiling": limit, "control": limit | {"ap3d": 0.123456}}}
     html = render_reconstruction_html(scores, reconstruction.scenes, drawn[:1], drawn[1:])
     assert "0.9877" in html and "0.1235" in html
@@ -82,10 +81,18 @@ def test_reconstruction_page_shows_truth_and_reconstruction(reconstruction_datas
     assert not missing
 
 
-def test_limits_of_reconstruction_are_perfect_and_damaged(reconstruction_dataset, reconstruction):
+def test_limits_of_reconstruction_are_perfect_and_damaged(reconstruction_dataset, reconstruction, tmp_path):
     spec = load_lvae(str(reconstruction_dataset / "lvae")).spec
-    found = score_limits(select_scenes(reconstruction_dataset), spec)
+    found = score_limits(select_scenes(reconstruction_dataset), spec, str(tmp_path))
     ceiling, control = found["ceiling"], found["control"]
     assert ceiling["scenes"] == 11 and ceiling.keys() == reconstruction.scores.keys() - {"label_existence_threshold"}
     assert ceiling["ap3d"] > 0.95 and ceiling["raster_ground_iou"] > 0.999
     assert control["ap3d"] < 0.6 * ceiling["ap3d"] and control["ground_iou"] < 0.95 * ceiling["ground_iou"]
+    (lost,) = (tmp_path / "control").glob("chunk-00000.parquet")
+    lost.unlink()
+    written, done = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*.parquet")}, []
+    assert score_limits(select_scenes(reconstruction_dataset), spec, str(tmp_path), on_scenes=done.append) == found
+    again = {p for p, time in written.items() if p.stat().st_mtime_ns != time}
+    assert sum(done) == 11 and again == {tmp_path / "ceiling/chunk-00000.parquet"} and lost.exists()
+    other = score_limits(select_scenes(reconstruction_dataset), spec.with_resolution(16), str(tmp_path))
+    assert other["ceiling"]["raster_px"] == 16

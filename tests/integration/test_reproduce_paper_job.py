@@ -14,7 +14,7 @@ from pipelines.preprocess.sources.town.generator import generate_town, write_kit
 SMALL = {"scale": "mini", "lvae-steps": 4, "dit-steps": 4, "num-scenes": 12, "num-inference-steps": 3}
 
 
-def start(raw: Path, output: Path, *more: str) -> subprocess.Popen[str]:
+def start_reproduction(raw: Path, output: Path, *more: str) -> subprocess.Popen[str]:
     words = [sys.executable, "jobs/reproduce_paper.py", "kitti360", "--input", raw, "--output", output, *more]
     words += [word for name, value in SMALL.items() for word in (f"--{name}", str(value))]
     env = os.environ | {"PYTHONPATH": "", "PYTHONUNBUFFERED": "1"}
@@ -22,16 +22,16 @@ def start(raw: Path, output: Path, *more: str) -> subprocess.Popen[str]:
 
 
 def reproduce(raw: Path, output: Path, *more: str) -> str:
-    process = start(raw, output, *more)
+    process = start_reproduction(raw, output, *more)
     printed = process.communicate()[0]
     assert process.returncode == 0, printed[-6000:]
     return printed
 
 
-def stop_in(stage: str, raw: Path, output: Path) -> None:
-    """Stop the job as soon as it prints a text."""
-    process = start(raw, output)
-    assert process.stdout is not None and any(stage in line for line in process.stdout)
+def stop_at_line(text: str, raw: Path, output: Path) -> None:
+    """Send SIGTERM to the job when it prints a line with a text."""
+    process = start_reproduction(raw, output)
+    assert process.stdout is not None and any(text in line for line in process.stdout)
     process.terminate()
     assert "run the same command again to resume" in process.communicate()[0] and process.returncode != 0
 
@@ -53,10 +53,10 @@ def test_rehearsal_resumes_and_second_call_repeats_nothing(tmp_path):
     for seed in (3, 4):
         write_kitti360(generate_town(seed), tmp_path / "raw", seed=seed)
     output = tmp_path / "out"
-    stop_in("[1/8]", tmp_path / "raw", output)
-    stop_in("1 worker, from step 0", tmp_path / "raw", output)
+    stop_at_line("[1/8]", tmp_path / "raw", output)
+    stop_at_line("1 worker, from step 0", tmp_path / "raw", output)
     tables = read_times(output / "datasets")
-    stop_in("[5/8]", tmp_path / "raw", output)
+    stop_at_line("[5/8]", tmp_path / "raw", output)
     weights = read_times(output / "runs")
     assert tables and weights
     assert "[8/8] write the tables" in reproduce(tmp_path / "raw", output)

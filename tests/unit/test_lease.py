@@ -123,11 +123,10 @@ def test_process_ids_are_recognised_after_reuse():
 
 def test_sigterm_stops_the_job_and_ends_its_lease_as_killed(tmp_path):
     from jobs.support.outputs import hold_lease
-    from jobs.support.stopping import JobStopped, stop_on_sigterm
+    from jobs.support.stopping import JobStopped
 
     before = signal.getsignal(signal.SIGTERM)
-    stopped = pytest.raises(JobStopped, match=r"the job was stopped \(SIGTERM\)")
-    with stopped, stop_on_sigterm(), hold_lease(str(tmp_path), "run"):
+    with pytest.raises(JobStopped, match=r"the job was stopped \(SIGTERM\)"), hold_lease(str(tmp_path), "run"):
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(30)
     assert signal.getsignal(signal.SIGTERM) == before
@@ -136,6 +135,24 @@ def test_sigterm_stops_the_job_and_ends_its_lease_as_killed(tmp_path):
     joined = make_lease(tmp_path, "job-2")
     joined.acquire("join")  # An ended job is not waited for.
     joined.release("finished")
+
+
+def test_second_sigterm_does_not_interrupt_the_cleanup():
+    from jobs.support.stopping import JobStopped, keep_sigterm_handler, stop_on_sigterm
+
+    cleaned = []
+    with pytest.raises(JobStopped), stop_on_sigterm():
+        with keep_sigterm_handler():  # As around `ray.init`, which replaces the handler.
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        try:
+            with stop_on_sigterm():  # A part of the job.
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(30)
+        finally:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.2)
+            cleaned.append(True)
+    assert cleaned == [True] and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 def test_repeated_request_of_the_same_writer_is_no_conflict(tmp_path, monkeypatch):

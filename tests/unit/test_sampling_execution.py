@@ -71,7 +71,8 @@ def test_batches_share_a_denoiser_until_something_changes():
     first = pipeline.make_denoiser(times, label)
     assert pipeline.make_denoiser(times, label.flip(0)) is first
     assert pipeline.make_denoiser(times, label, 2.0) is not pipeline.make_denoiser(times, label)
-    assert pipeline.make_denoiser(times, label) is not pipeline.make_denoiser(times, torch.tensor([2]))
+    only, both = pipeline.make_denoiser(times, label), pipeline.make_denoiser(times, torch.tensor([2]))
+    assert only is not both and pipeline.make_denoiser(times, label) is both  # The second one knows all three labels.
     assert pipeline.make_denoiser(times, label) is not pipeline.make_denoiser(times[1:], label)
     inputs = torch.randn(3, *pipeline.latent_shape), torch.tensor([500] * 3), label
     before = pipeline.make_denoiser(times, label)(*inputs)
@@ -82,6 +83,27 @@ def test_batches_share_a_denoiser_until_something_changes():
     last = pipeline.make_denoiser(times, label)
     pipeline.set_execution(SamplingExecution(decode_batch_size=2))
     assert pipeline.make_denoiser(times, label) is not last
+
+
+def test_batches_of_a_run_capture_one_graph(monkeypatch):
+    captured = []
+
+    def capture(model, *inputs):
+        captured.append(inputs[0].shape)
+        return record_graph(model, *inputs)
+
+    monkeypatch.setattr(SamplingExecution, "wrap", lambda execution, model, device: FixedShapeDenoiser(model, capture))
+    pipeline = make_pipeline()
+    parts = [pipeline.sample_latents(LABELS, 1, range(k, k + 3), 10) for k in (0, 3)]
+    assert captured == [(3, *pipeline.latent_shape)]
+    monkeypatch.undo()
+    assert torch.equal(torch.cat(parts), make_pipeline().sample_latents(2 * LABELS, 1, range(6), 10))
+
+
+def test_pipeline_samples_in_inference_mode():
+    expected = make_pipeline().sample_latents(LABELS, 1, range(3), 4)
+    with torch.inference_mode():
+        assert torch.equal(make_pipeline().sample_latents(LABELS, 1, range(3), 4), expected)
 
 
 def test_each_shape_is_captured_once_and_results_are_kept():
