@@ -11,7 +11,8 @@ The script needs models/ and its packages. Where this project is not installed, 
 
 The sections:
 
-* latency: time of one scene (250 and 20 steps, batch 1) of DiT-B, L and XL, share of decoding, and peak memory
+* latency: time of one scene (250 and 20 steps, batch 1) of DiT-B, L and XL after the first one, share of decoding, and
+  peak memory
 * throughput: scenes per second for batches, and the share of the GPU's peak (MFU)
 * train_dit: time of a training step of DiT-B at batch 256, and MFU
 * train_lvae: time of a training step of the layout VAE at batch 32, share of matching, and MFU
@@ -188,7 +189,11 @@ def measure_memory(setup: Setup, found: dict[str, float]) -> Iterator[None]:
 
 
 def measure_scene(setup: Setup, pipeline: PrITTIPipeline, steps: int) -> tuple[float, float]:
-    """Return the times of sampling and of decoding one scene (s)."""
+    """Return the times of sampling and of decoding one scene (s), without the set-up of the first call.
+
+    The first call computes the modulations and captures the CUDA graph; further calls with the same timesteps and
+    labels share them.
+    """
 
     def sample() -> torch.Tensor:
         return pipeline.sample_latents(["low"], 0, [0], steps)

@@ -268,7 +268,6 @@ def _list_transformer_stages(
             num_scenes=scenes,
             seed=config.seed,
             num_inference_steps=config.num_inference_steps,
-            cuda_graphs=True,
             num_actors=workers,
             **shared,
         ),
