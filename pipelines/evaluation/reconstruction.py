@@ -246,6 +246,17 @@ def score_chunk(
     return {"id": row["id"], "scenes": len(rows)}
 
 
+def guard_records(directory: str, selection: SceneSubset, options: dict) -> None:
+    """Delete the records in a directory if they belong to other scenes or options."""
+    guard_options(
+        storage.join_uri(directory, "records.json"),
+        options | {"version": RECORDS_VERSION, "selection": asdict(selection), "files": selection.files()},
+        is_in_use=lambda: False,
+        discard=lambda: storage.delete_directory(directory),
+        describe=str,
+    )
+
+
 def make_records_path(directory: str, number: int) -> str:
     """Return the path of the file with the records of a chunk."""
     return storage.join_uri(directory, f"chunk-{number:05d}.parquet")
@@ -321,22 +332,9 @@ def evaluate_reconstruction(
     spec, deduplicate = model.spec, model.proposes_duplicates
     voxels = make_voxel_grid(spec, voxel_range_m)
     options = {"deduplicate": deduplicate, "label_threshold": label_threshold}
-    guard_options(
-        storage.join_uri(directory, "records.json"),
-        options
-        | {
-            "version": RECORDS_VERSION,
-            "selection": asdict(selection),
-            "files": selection.files(),
-            "weights": digest_weights(model),
-            "batch_size": batch_size,
-            "voxel_range_m": list(voxel_range_m),
-            "labels": dataset and [asdict(dataset.vegetation), asdict(dataset.vehicle)],
-        },
-        is_in_use=lambda: False,
-        discard=lambda: storage.delete_directory(directory),
-        describe=str,
-    )
+    labels = dataset and [asdict(dataset.vegetation), asdict(dataset.vehicle)]
+    inputs = {"weights": digest_weights(model), "batch_size": batch_size, "voxel_range_m": list(voxel_range_m)}
+    guard_records(directory, selection, options | inputs | {"labels": labels})
     promised = {make_records_path(directory, number): len(rows) for number, (_, rows) in enumerate(chunks)}
     faulty = storage.find_faulty_files(promised)
     missing = [number for number, path in enumerate(promised) if path in faulty]
@@ -483,13 +481,7 @@ def score_limits(
     """
     voxels, chunks = make_voxel_grid(spec, voxel_range_m), split_chunks(selection, SCENES_PER_TASK)
     inputs = {"layout": spec.fingerprint(), "voxel_range_m": list(voxel_range_m), "control": RECONSTRUCTION_CONTROL}
-    guard_options(
-        storage.join_uri(directory, "records.json"),
-        inputs | {"version": RECORDS_VERSION, "selection": asdict(selection), "files": selection.files()},
-        is_in_use=lambda: False,
-        discard=lambda: storage.delete_directory(directory),
-        describe=str,
-    )
+    guard_records(directory, selection, inputs)
     paths = {
         name: [make_records_path(storage.join_uri(directory, name), number) for number in range(len(chunks))]
         for name in LIMITS

@@ -46,7 +46,8 @@ OVERALL = {
     "voxels.miou": "voxel mIoU",
     "label_fidelity.joint_fidelity": "label fidelity",
 }
-OF_TRUTH = ("ground_outside_bounds", "objects_outside_bounds", "label_fidelity.joint_fidelity")
+# Scores without a ceiling and a control: they describe the true scenes, or need the thresholds of a dataset.
+WITHOUT_LIMITS = ("ground_outside_bounds", "objects_outside_bounds", "label_fidelity.joint_fidelity")
 VARIANTS = {
     "ranked": ("all", "unlimited"),
     "ranked_100": ("all", str(MAX_DETECTIONS)),
@@ -233,6 +234,9 @@ def find_score(scores: Mapping, path: str) -> Any:
     Args:
         scores: Nested scores.
         path: Names from the outside to the inside, with dots between them.
+
+    Returns:
+        The score.
     """
     for name in path.split("."):
         scores = scores[name]
@@ -246,9 +250,9 @@ def select_overall_scores(scores: Mapping) -> dict[str, float]:
         scores: Nested scores of `score_limits`.
 
     Returns:
-        Scores by their paths, such as "matched.found". Scores that describe only the true scenes are left out.
+        Scores by their paths, such as "matched.found", except WITHOUT_LIMITS.
     """
-    return {path: find_score(scores, path) for path in OVERALL if path not in OF_TRUTH}
+    return {path: find_score(scores, path) for path in OVERALL if path not in WITHOUT_LIMITS}
 
 
 def build_category_table(scores: Mapping) -> Table:
