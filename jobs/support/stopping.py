@@ -11,8 +11,6 @@ from types import FrameType
 
 Handler = Callable[[int, FrameType | None], None]
 _reasons: list[str] = []  # Reason for a SIGTERM that this process sends to itself.
-
-
 _handlers: list[Handler] = []  # The handler that `stop_on_sigterm` has installed.
 
 
