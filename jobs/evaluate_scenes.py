@@ -29,10 +29,10 @@ training scenes with as many generated scenes, only by distances of VGG16 featur
 
 The job writes metrics.json, metrics.parquet and evaluation.html, and logs all results to MLflow. With --lvae, the job
 also writes reconstruction.html (the best and the worst scenes), reconstruction.parquet (one row per scene) and
-limits.json, which holds the ceiling and the control of the reconstruction. FID, sFID, KID, IS, precision and recall
-need a local file of Inception weights. Without Inception weights, the job reports distances of layout statistics, of
-relations between objects and ground, and of features of EfficientNet-Lite0 (extra lite0) and of a fixed random
-network, under separate names. Run the same command again to resume after an interruption.
+reconstruction_sets.json, which holds the ceiling and the control of the reconstruction. FID, sFID, KID, IS, precision
+and recall need a local file of Inception weights. Without Inception weights, the job reports distances of layout
+statistics, of relations between objects and ground, and of features of EfficientNet-Lite0 (extra lite0) and of a fixed
+random network, under separate names. Run the same command again to resume after an interruption.
 """
 
 from __future__ import annotations

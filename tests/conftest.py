@@ -243,6 +243,7 @@ def town_dataset(tmp_path_factory) -> str:
     description = {
         "source": "town",
         "options": {"num_train": 8, "seed": 0},
+        "scenes": {"train": 8, "test": 4},
         "layout": LayoutSpec(categories=tuple(TOWN_SLOTS), slots=tuple(TOWN_SLOTS.values())).to_dict(),
         "vegetation_thresholds": thresholds,
         "vehicle_thresholds": thresholds,

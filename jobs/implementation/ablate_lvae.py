@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 import os
 import platform
 import re
@@ -33,7 +35,7 @@ from models.training import count_flops
 from models.vae.config import override_options
 from pipelines.evaluation import ablation
 from pipelines.evaluation.ablation import Variant
-from pipelines.evaluation.reconstruction import evaluate_reconstruction, score_limits
+from pipelines.evaluation.reconstruction import evaluate_reconstruction, score_ceiling_and_control
 from pipelines.reporting.chart import Chart, make_standalone_svg
 from pipelines.reporting.report import Table
 from pipelines.runtime import storage
@@ -142,7 +144,7 @@ def compare_variants(config: Branches) -> str:
         raise ValueError(f"--minutes is {config.minutes}, --num-seeds is {config.num_seeds}: both must be more than 0")
     if config.max_scenes is not None and config.max_scenes < 2:
         raise ValueError(
-            f"--max-scenes is {config.max_scenes}, expected 2 or more: the control decodes the latents of other scenes"
+            f"--max-scenes is {config.max_scenes}, expected 2 or more: scenes are also decoded from latents of others"
         )
     find_preset(LVAE_PRESETS, config.preset)
     chosen = select_variants(config)
@@ -159,10 +161,11 @@ def compare_variants(config: Branches) -> str:
                 if not storage.exists(path):
                     storage.write_json(train_variant(config, variant, seed, output), path)
                 scores.append(storage.read_json(path))
+                require_same_scenes(scores[-1], select_held_out(config, scores[-1]["dataset"]))
                 kept = {f"{make_slug(variant)}.{name}": scores[-1].get(name) for name in ablation.MEASURES}
                 tracker.metrics({name: value for name, value in kept.items() if value is not None}, seed)
         rows, curves = ablation.group_by_variant(scores), ablation.draw_curve_chart(scores)
-        table = ablation.build_variant_table(rows, measure_limits(config, scores[0]["dataset"], output))
+        table = ablation.build_variant_table(rows, score_held_out(config, scores[0]["dataset"], output))
         write_tables(output, config.name, rows, [table], curves)
         is_timed = is_at_equal_time(config) and not config.steps
         equal = "the same training time" if is_timed else "the same number of steps"
@@ -172,12 +175,33 @@ def compare_variants(config: Branches) -> str:
         return output
 
 
-def measure_limits(config: Branches, root: str, output: str) -> dict[str, dict]:
+def select_held_out(config: Branches, root: str) -> SceneSubset:
+    """Return the held-out scenes of a dataset that a study scores."""
+    return SceneSubset(root, Dataset.open(root).source, "test", config.max_scenes)
+
+
+def require_same_scenes(scores: dict, selection: SceneSubset) -> None:
+    """Check that the scores of a variant describe the present scenes.
+
+    Raises:
+        ValueError: The held-out scenes were replaced after the scores were written.
+    """
+    if scores.get("held_out_scenes", digest_files(selection)) != digest_files(selection):  # Old studies lack it.
+        raise ValueError(
+            f"the held-out scenes of {selection.root} have changed since {scores['variant']!r} was scored; "
+            "use another --output (and another --name)"
+        )
+
+
+def digest_files(selection: SceneSubset) -> str:
+    """Return a digest of the files and rows of selected scenes."""
+    return hashlib.sha256(json.dumps(selection.files()).encode()).hexdigest()[:16]
+
+
+def score_held_out(config: Branches, root: str, output: str) -> dict[str, dict]:
     """Return the scores of the ceiling and the control on the held-out scenes of a dataset."""
-    dataset = Dataset.open(root)
-    selection = SceneSubset(root, dataset.source, "test", config.max_scenes)
-    spec = dataset.spec.with_resolution(find_preset(LVAE_PRESETS, config.preset).raster_px)
-    return score_limits(selection, spec, storage.join_uri(output, "limits"))
+    spec = Dataset.open(root).spec.with_resolution(find_preset(LVAE_PRESETS, config.preset).raster_px)
+    return score_ceiling_and_control(select_held_out(config, root), spec, storage.join_uri(output, "sets"))
 
 
 def select_variants(config: Branches) -> dict[str, Variant]:
@@ -241,11 +265,11 @@ def train_variant(config: Branches, variant: str, seed: int, output: str) -> dic
     model = fit(training, config.num_workers, storage.join_uri(output, "models", f"{make_slug(variant)}-seed{seed}"))
     seconds = sum_training_seconds(training.tracker.history("scenes_per_second"), training.stream.batch_size)
     root = training.identity["dataset"]
-    source = training.stream.shards[0].source
     records = storage.join_uri(output, "reconstructed", f"{make_slug(variant)}-seed{seed}")
-    selection = SceneSubset(root, source, "test", config.max_scenes)
+    selection = select_held_out(config, root)
     reconstruction = evaluate_reconstruction(selection, model, records).scores
     described = {"variant": variant, "seed": seed, "steps": steps, "dataset": root}
+    described |= {"held_out_scenes": digest_files(selection)}
     trained, example = load_lvae(model), training.stream.shards[0].scenes([0])
     described |= {"parameters": trained.num_parameters(), "training_seconds": seconds}
     described |= {"gflops": count_gflops(trained, make_layout_batch(example, trained.spec))}

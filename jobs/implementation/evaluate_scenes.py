@@ -38,7 +38,7 @@ from pipelines.evaluation.features import (
     count_scenes,
     drop_blank,
 )
-from pipelines.evaluation.reconstruction import draw_scenes, evaluate_reconstruction, score_limits
+from pipelines.evaluation.reconstruction import draw_scenes, evaluate_reconstruction, score_ceiling_and_control
 from pipelines.evaluation.streamed import compare_streamed
 from pipelines.metrics.adm_npz import read_picture_shape, read_reference_moments
 from pipelines.metrics.controls import CONTROLS
@@ -405,15 +405,15 @@ def score_reconstruction(config: Config, dataset: Dataset, output: str, bar: Job
         label_threshold=read_existence_threshold(lvae),
     )
     task = bar.add_task("score ceiling and control", total=rebuilt.scores["scenes"])
-    limits = score_limits(
+    sets = score_ceiling_and_control(
         real,
         load_lvae(lvae).spec,
-        storage.join_uri(output, "limits"),
+        storage.join_uri(output, "reconstruction_sets"),
         config.voxel_range_m,
         lambda count: bar.advance(task, count),
     )
-    storage.write_json(limits, storage.join_uri(output, "limits.json"))
-    scores = rebuilt.scores | {"limits": {name: select_overall_scores(found) for name, found in limits.items()}}
+    storage.write_json(sets, storage.join_uri(output, "reconstruction_sets.json"))
+    scores = rebuilt.scores | {"sets": {name: select_overall_scores(found) for name, found in sets.items()}}
     storage.write_parquet(rebuilt.scenes, storage.join_uri(output, "reconstruction.parquet"))
     count = min(config.num_examples, len(rebuilt.places) // 2)
     drawn = []

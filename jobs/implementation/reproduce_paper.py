@@ -238,7 +238,7 @@ def describe_run(config: PaperConfig) -> list[str]:
 def collect_scores(config: PaperConfig) -> Reproduced:
     """Read the scores of all evaluations."""
     ours = storage.read_json(home_path("evaluations", "reconstruction", "metrics.json"))["reconstruction"]
-    limits = storage.read_json(home_path("evaluations", "reconstruction", "limits.json"))
+    sets = storage.read_json(home_path("evaluations", "reconstruction", "reconstruction_sets.json"))
     study = home_path("ablations", "branches", "branches.json")
     if storage.exists(study):
         ours |= {"ablation": {row["variant"]: row for row in storage.read_json(study)["rows"]}}
@@ -273,7 +273,7 @@ def collect_scores(config: PaperConfig) -> Reproduced:
             scores |= {name: value for name, value in compared.items() if name == "memorisation"}
             notes |= describe_memorisation(compared)
         generation[size] = scores
-    return Reproduced({"ours": ours} | limits, generation, notes)
+    return Reproduced({"ours": ours} | sets, generation, notes)
 
 
 def list_evaluated_sizes(config: PaperConfig) -> list[str]:

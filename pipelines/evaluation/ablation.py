@@ -353,7 +353,7 @@ AUGMENTATION_VARIANTS = {
 }
 MEASURES = {"ground_iou": "ground", "height_mse_normalised": "ground", "height_rmse_m": "ground"}
 ACCURACY_SCENES = 128  # The driver holds these scenes in memory.
-OBJECT_MEASURES = ("ap3d", "ap3d_50", "recall_1m", "median_center_error_m", "control_center_error_m")
+OBJECT_MEASURES = ("ap3d", "ap3d_50", "recall_1m", "median_center_error_m", "other_latent_center_error_m")
 MEASURES |= dict.fromkeys(OBJECT_MEASURES, "objects")
 
 
@@ -378,7 +378,7 @@ def measure_accuracy(model: LayoutVAE, selection: SceneSubset, batch_size: int =
         batch_size: Number of scenes per forward pass.
 
     Returns:
-        The scores of `Accuracy` by name, and `control_center_error_m`: the median centre error if each scene is
+        The scores of `Accuracy` by name, and `other_latent_center_error_m`: the median centre error if each scene is
         decoded from the latent of another selected scene. A decoder that ignores the latent has the same error with
         both latents.
     """
@@ -391,8 +391,8 @@ def measure_accuracy(model: LayoutVAE, selection: SceneSubset, batch_size: int =
         parts = zip(batches, latents.split(batch_size), strict=True)
         return compute_accuracy(join_pairs([pair_primitives(model.decode(z), batch, model.spec) for batch, z in parts]))
 
-    control = score(latents.roll(len(scenes) // 2, dims=0))
-    return asdict(score(latents)) | {"control_center_error_m": control.median_center_error_m}
+    other = score(latents.roll(len(scenes) // 2, dims=0))
+    return asdict(score(latents)) | {"other_latent_center_error_m": other.median_center_error_m}
 
 
 def group_by_variant(scores: Iterable[dict]) -> list[dict]:
@@ -463,12 +463,12 @@ def build_yaw_table(rows: Sequence[dict]) -> Table:
     return Table("IoU3D loss by yaw error", columns, cells, note=note)
 
 
-def build_variant_table(rows: Sequence[dict], limits: Mapping[str, Mapping]) -> Table:
+def build_variant_table(rows: Sequence[dict], sets: Mapping[str, Mapping]) -> Table:
     """Make the table of variants.
 
     Args:
         rows: Rows of `group_by_variant`.
-        limits: Scores of the ceiling and of the control on the same scenes (`score_limits`), by name.
+        sets: Scores of the ceiling and of the control on the same scenes (`score_ceiling_and_control`), by name.
 
     Returns:
         The table; its last rows are the ceiling and the control.
@@ -483,9 +483,9 @@ def build_variant_table(rows: Sequence[dict], limits: Mapping[str, Mapping]) -> 
     }
     names = {name: text for name, text in names.items() if any(row[f"{name}_mean"] is not None for row in rows)}
     columns = ["variant", "parameters", "GFLOP", "seeds", "steps", "minutes", *names.values()]
-    error, control = "median_center_error_m_mean", "control_center_error_m_mean"
+    error, other = "median_center_error_m_mean", "other_latent_center_error_m_mean"
     if has_errors := any(row[error] is not None for row in rows):
-        columns.append("centre error (control), cm")
+        columns.append("centre error (other latent), cm")
     cells = []
     for row in rows:
         cell: list = [row["variant"], f"{row['parameters']:,}", round(row["gflops"], 2), row["seeds"], row["steps"]]
@@ -496,9 +496,9 @@ def build_variant_table(rows: Sequence[dict], limits: Mapping[str, Mapping]) -> 
             known = None not in values
             cell.append("{} ({} to {})".format(*(format(100 * v, digits) for v in values)) if known else None)
         if has_errors:
-            cell.append(None if row[error] is None else f"{100 * row[error]:.0f} ({100 * row[control]:.0f})")
+            cell.append(None if row[error] is None else f"{100 * row[error]:.0f} ({100 * row[other]:.0f})")
         cells.append(cell)
-    for name, found in limits.items():
+    for name, found in sets.items():
         known = {key: None if found.get(key) is None else f"{100 * found[key]:.3g}" for key in names}
         cells.append([f"{name}, no network", *[None] * 5, *known.values(), *[None] * has_errors])
     note = (
@@ -506,10 +506,10 @@ def build_variant_table(rows: Sequence[dict], limits: Mapping[str, Mapping]) -> 
         "GFLOP is the cost to encode and decode one scene. Minutes are those of the training steps. "
         f"Recall and centre error are those of at most {ACCURACY_SCENES} scenes. Recall: the share of primitives whose "
         "matched proposal has an existence probability above the threshold and lies within 1 m. The centre error is "
-        "the median distance between a primitive and its matched proposal of any existence probability. The control "
-        "decodes each scene from the latent of another scene. A decoder that ignores the latent has the same error "
-        "with both latents. The last two rows need no network: the ceiling converts each scene to layout tensors and "
-        f"back; the control does the same with {RECONSTRUCTION_CONTROL}."
+        "the median distance between a primitive and its matched proposal of any existence probability; in brackets, "
+        "if each scene is decoded from the latent of another scene. A decoder that ignores the latent has the same "
+        "error with both latents. The last two rows need no network: the ceiling converts each scene to layout tensors "
+        f"and back; the control does the same with {RECONSTRUCTION_CONTROL}."
     )
     return Table("Variants of the layout VAE", columns, cells, note=note)
 

@@ -24,7 +24,7 @@ from pipelines.evaluation.features import READER_CPUS, judge_labels
 from pipelines.geometry.voxels import NUM_CLASSES, OutsideCounts, VoxelGrid, count_outside, voxelize
 from pipelines.metrics.controls import RECONSTRUCTION_CONTROL, damage_scene
 from pipelines.metrics.reconstruction import (
-    LIMITS,
+    CEILING_AND_CONTROL,
     MAX_DETECTIONS,
     MEMORY,
     SCORED,
@@ -77,8 +77,8 @@ SCENE_SCORES = pa.schema(
             "height_mae_m",
             "height_rmse_m",
             "mean_iou3d",
-            "found",
-            "right",
+            "matched_recall",
+            "matched_precision",
             "voxel_iou",
             "voxel_miou",
         )
@@ -455,7 +455,7 @@ def compute_reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, 
     }
 
 
-def score_limits(
+def score_ceiling_and_control(
     selection: SceneSubset,
     spec: LayoutSpec,
     directory: str,
@@ -484,7 +484,7 @@ def score_limits(
     guard_records(directory, selection, inputs)
     paths = {
         name: [make_records_path(storage.join_uri(directory, name), number) for number in range(len(chunks))]
-        for name in LIMITS
+        for name in CEILING_AND_CONTROL
     }
     promised = {of[number]: len(rows) for of in paths.values() for number, (_, rows) in enumerate(chunks)}
     faulty = storage.find_faulty_files(promised)
@@ -494,11 +494,11 @@ def score_limits(
 
     def score_scenes(number: int) -> int:
         shard, rows = chunks[number]
-        found: dict[str, list[dict]] = {name: [] for name in LIMITS}
+        found: dict[str, list[dict]] = {name: [] for name in CEILING_AND_CONTROL}
         for row, scene in zip(rows, shard.scenes(rows), strict=True):
             moved = damage_scene("moved", scene, scene, (shard.number, row))
             damaged = damage_scene("ground_shifted", moved, moved, (shard.number, row))
-            for name, source in zip(LIMITS, (scene, damaged), strict=True):
+            for name, source in zip(CEILING_AND_CONTROL, (scene, damaged), strict=True):
                 record = make_scene_record(scene, represent_scene(source, spec), np.zeros((1, 1, 1)), spec, voxels)
                 found[name].append({"row": row, "scene_id": scene.scene_id} | record.to_row())
         for name, records in found.items():
@@ -509,8 +509,8 @@ def score_limits(
         if on_scenes:
             on_scenes(count)
     storage.require_rows(promised)
-    merged = ray.get([merge_records.remote(paths[name], spec, voxels) for name in LIMITS])
-    return {name: scores for name, (scores, _, _) in zip(LIMITS, merged, strict=True)}
+    merged = ray.get([merge_records.remote(paths[name], spec, voxels) for name in CEILING_AND_CONTROL])
+    return {name: scores for name, (scores, _, _) in zip(CEILING_AND_CONTROL, merged, strict=True)}
 
 
 def represent_scene(scene: Scene, spec: LayoutSpec) -> DecodedLayout:
@@ -548,8 +548,8 @@ def compute_scene_scores(scene_ids: list[str], records: list[SceneRecord]) -> pa
                 "height_mae_m": share(ground.absolute_m.sum(), ground.pixels.sum()),
                 "height_rmse_m": mean_square_m2 and mean_square_m2**0.5,
                 "mean_iou3d": share(iou, pairs),
-                "found": share(pairs, r.pairs.truths[boxes].sum()),
-                "right": share(pairs, r.pairs.predictions[boxes].sum()),
+                "matched_recall": share(pairs, r.pairs.truths[boxes].sum()),
+                "matched_precision": share(pairs, r.pairs.predictions[boxes].sum()),
                 "voxel_iou": voxel and voxel.iou,
                 "voxel_miou": voxel and voxel.miou,
             }

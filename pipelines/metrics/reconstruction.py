@@ -24,7 +24,7 @@ from pipelines.schema.palette import CLASS_ID, EMPTY
 
 THRESHOLDS = np.linspace(0.05, 0.50, 10)  # The ten IoU3D thresholds of Omni3D.
 RECALL_POINTS = np.linspace(0.0, 1.0, 101)
-LIMITS = ("ceiling", "control")  # Scores without a network that stand next to those of a model.
+CEILING_AND_CONTROL = ("ceiling", "control")  # Scores without a network that stand next to those of a model.
 MAX_DETECTIONS = 100  # Maximum number of detections per scene and category, as in Omni3D.
 SCORED = tuple(c for c in range(len(CATEGORIES)) if c != ELLIPSOID)  # The paper does not score ellipsoids.
 
@@ -452,22 +452,22 @@ class PairScores:
     Attributes:
         mean_iou3d: Mean over matched pairs. None: there are no pairs.
         truth_iou3d: Mean over true primitives; a true primitive without a partner counts as 0.
-        found: Share of true primitives that are matched.
-        right: Share of predictions that are matched. None: there are no predictions.
+        recall: Share of true primitives that are matched.
+        precision: Share of predictions that are matched. None: there are no predictions.
         category_mean_iou3d: `mean_iou3d` per category.
         category_truth_iou3d: `truth_iou3d` per category.
-        category_found: `found` per category.
-        category_right: `right` per category.
+        category_recall: `recall` per category.
+        category_precision: `precision` per category.
     """
 
     mean_iou3d: float | None
     truth_iou3d: float
-    found: float
-    right: float | None
+    recall: float
+    precision: float | None
     category_mean_iou3d: dict[str, float]
     category_truth_iou3d: dict[str, float]
-    category_found: dict[str, float]
-    category_right: dict[str, float]
+    category_recall: dict[str, float]
+    category_precision: dict[str, float]
 
 
 def compute_pair_scores(sums: PairSums) -> PairScores:
@@ -493,12 +493,12 @@ def compute_pair_scores(sums: PairSums) -> PairScores:
     return PairScores(
         mean_iou3d=float(total[3] / total[2]) if total[2] else None,
         truth_iou3d=float(total[3] / total[0]),
-        found=float(total[2] / total[0]),
-        right=float(total[2] / total[1]) if total[1] else None,
+        recall=float(total[2] / total[0]),
+        precision=float(total[2] / total[1]) if total[1] else None,
         category_mean_iou3d=by_category(iou, pairs),
         category_truth_iou3d=by_category(iou, truths),
-        category_found=by_category(pairs, truths),
-        category_right=by_category(pairs, predictions),
+        category_recall=by_category(pairs, truths),
+        category_precision=by_category(pairs, predictions),
     )
 
 

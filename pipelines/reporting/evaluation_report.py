@@ -29,7 +29,6 @@ from pipelines.reporting.report import (
 DETAILS = (
     "sets.",
     "peers.",
-    "limits.",
     "category_validity.",
     "two_sample_features.",
     "relation_distance.",

@@ -188,7 +188,7 @@ def compare_with_paper(source: str, found: Reproduced) -> list[dict]:
             sides = [scores, scores.get("sets", {}).get("ceiling", {}), scores.get("sets", {}).get("moved", {})]
         else:
             sides = [found.reconstruction.get(name, {}) for name in ("ours", "ceiling", "control")]
-        paths = (number.score, *[find_score_of_limits(number.score)] * 2)
+        paths = (number.score, *[find_ceiling_path(number.score)] * 2)
         ours, ceiling, control = (
             None if (value := find_score(side, path)) is None else value * number.factor
             for side, path in zip(sides, paths, strict=True)
@@ -206,7 +206,7 @@ def compare_with_paper(source: str, found: Reproduced) -> list[dict]:
     return rows
 
 
-def find_score_of_limits(path: str) -> str:
+def find_ceiling_path(path: str) -> str:
     """Return the path of the score of ceiling and control that belongs to a score.
 
     Ablations are evaluated on the same scenes as the full layout VAE and have the same ceiling and control.

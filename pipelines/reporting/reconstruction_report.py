@@ -11,7 +11,7 @@ import pyarrow as pa
 from models.scene import CATEGORIES, GROUND_CLASSES
 from models.tensors import EXISTENCE_THRESHOLD
 from pipelines.metrics.controls import RECONSTRUCTION_CONTROL
-from pipelines.metrics.reconstruction import LIMITS, MAX_DETECTIONS
+from pipelines.metrics.reconstruction import CEILING_AND_CONTROL, MAX_DETECTIONS
 from pipelines.reporting.chart import Chart
 from pipelines.reporting.dataset_charts import spell_name
 from pipelines.reporting.report import Charts, Figure, KeyFigures, Picture, Pictures, Table, Text, render_report_html
@@ -40,14 +40,14 @@ OVERALL = {
     "ap3d_50": "AP3D@50",
     "ap3d_ranked": "AP3D, ranked",
     "matched.mean_iou3d": "mean IoU3D",
-    "matched.found": "found",
-    "matched.right": "right",
+    "matched.recall": "recall, matched",
+    "matched.precision": "precision, matched",
     "voxels.iou": "voxel IoU",
     "voxels.miou": "voxel mIoU",
     "label_fidelity.joint_fidelity": "label fidelity",
 }
 # Scores without a ceiling and a control: they describe the true scenes, or need the thresholds of a dataset.
-WITHOUT_LIMITS = ("ground_outside_bounds", "objects_outside_bounds", "label_fidelity.joint_fidelity")
+WITHOUT_CEILING = ("ground_outside_bounds", "objects_outside_bounds", "label_fidelity.joint_fidelity")
 VARIANTS = {
     "ranked": ("all", "unlimited"),
     "ranked_100": ("all", str(MAX_DETECTIONS)),
@@ -117,7 +117,7 @@ def make_key_figures(scores: Mapping) -> KeyFigures:
             Figure(
                 _format_percent(matched["mean_iou3d"]),
                 "mean IoU3D",
-                f"{_format_percent(matched['found'])} of objects matched",
+                f"{_format_percent(matched['recall'])} of objects matched",
             ),
             Figure(_format_percent(voxels["iou"]), "voxel IoU"),
             Figure(_format_percent(voxels["miou"]), "voxel mIoU"),
@@ -199,17 +199,17 @@ def build_overall_table(scores: Mapping) -> Table:
         "ap3d_50": "mean over categories at the IoU3D threshold 0.50",
         "ap3d_ranked": "the same over all proposals, ranked by existence probability",
         "matched.mean_iou3d": "over matched pairs of boxes",
-        "matched.found": "share of true boxes that are matched with an overlapping reconstructed box",
-        "matched.right": "share of reconstructed boxes that are matched with an overlapping true box",
+        "matched.recall": "share of true boxes that are matched with an overlapping reconstructed box",
+        "matched.precision": "share of reconstructed boxes that are matched with an overlapping true box",
         "voxels.iou": "filled against empty voxels",
         "voxels.miou": "mean over all classes except the empty class",
         "label_fidelity.joint_fidelity": "share of scenes whose reconstruction has both density labels of the true"
         f" scene, with existence probabilities above {scores['label_existence_threshold']:g}; generated scenes can"
         " hardly reach a higher share",
     }
-    limits = [scores["limits"][name] for name in LIMITS]
+    sets = [scores["sets"][name] for name in CEILING_AND_CONTROL]
     rows: list[tuple] = [
-        (OVERALL[path], find_score(scores, path), *(limit.get(path) for limit in limits), PAPER.get(path))
+        (OVERALL[path], find_score(scores, path), *(found.get(path) for found in sets), PAPER.get(path))
         for path in meanings
     ]
     memory = scores["memory_bytes"]
@@ -220,7 +220,7 @@ def build_overall_table(scores: Mapping) -> Table:
     )
     return Table(
         "Overall scores",
-        ("measure", "this model", *LIMITS, "paper, KITTI-360"),
+        ("measure", "this model", *CEILING_AND_CONTROL, "paper, KITTI-360"),
         rows,
         meanings=[*meanings.values(), size],
         note=f"The ceiling converts each scene to layout tensors and back, without a network. The control does the same"
@@ -247,12 +247,12 @@ def select_overall_scores(scores: Mapping) -> dict[str, float]:
     """Return the scores of a ceiling or a control that the table of overall scores shows.
 
     Args:
-        scores: Nested scores of `score_limits`.
+        scores: Nested scores of `score_ceiling_and_control`.
 
     Returns:
-        Scores by their paths, such as "matched.found", except WITHOUT_LIMITS.
+        Scores by their paths, such as "matched.recall", except WITHOUT_CEILING.
     """
-    return {path: find_score(scores, path) for path in OVERALL if path not in WITHOUT_LIMITS}
+    return {path: find_score(scores, path) for path in OVERALL if path not in WITHOUT_CEILING}
 
 
 def build_category_table(scores: Mapping) -> Table:
@@ -262,14 +262,14 @@ def build_category_table(scores: Mapping) -> Table:
         "AP3D@50": ranked["category_ap3d_50"],
         f"AP3D, existence above {EXISTENCE_THRESHOLD}": kept["category_ap3d"],
         "mean IoU3D": matched["category_mean_iou3d"],
-        "found": matched["category_found"],
-        "right": matched["category_right"],
+        "recall": matched["category_recall"],
+        "precision": matched["category_precision"],
         "voxel IoU": scores["voxels"]["class_iou"],
     }
     rows = [
         (spell_name(name), scores["truths"].get(name, 0), *(values.get(name) for values in columns.values()))
         for name in CATEGORIES
-        if name in scores["truths"] or name in matched["category_right"]
+        if name in scores["truths"] or name in matched["category_precision"]
     ]
     note = (
         "Ellipsoids have no AP3D, as in the paper. The IoU3D of ellipsoids is computed by sampling. The overall "

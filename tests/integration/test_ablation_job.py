@@ -92,7 +92,7 @@ def test_variant_differs_from_preset_only_in_its_switch(empty_home):
         assert torch.isfinite(trainer.step(batch, range(row.batch_size))["loss"])
 
 
-def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys):
+def test_compare_variants_trains_each_seed_once(empty_home, town_dataset, monkeypatch, capsys):
     import jobs.implementation.ablate_lvae as job
 
     trained = []
@@ -100,16 +100,15 @@ def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys)
     def train_variant(config, variant, seed, output):
         trained.append((seed, variant))
         scores = {"ground_iou": 0.9 + 0.01 * seed, "height_mse_normalised": 1e-4, "height_rmse_m": 0.1}
-        described = {"variant": variant, "seed": seed, "steps": config.steps, "dataset": "DIR", "parameters": 1}
-        described |= {"gflops": 0.5}
+        described = {"variant": variant, "seed": seed, "steps": config.steps, "dataset": town_dataset, "parameters": 1}
+        held_out = job.digest_files(job.select_held_out(config, town_dataset))
+        described |= {"gflops": 0.5, "held_out_scenes": held_out}
         scores |= {"ap3d": 0.5, "ap3d_50": 0.25, "recall_1m": 0.6}
-        scores |= {"median_center_error_m": 0.4, "control_center_error_m": 5.0}
+        scores |= {"median_center_error_m": 0.4, "other_latent_center_error_m": 5.0}
         described |= {"training_seconds": 1.0, "curve": [(2, 0.1), (7, 0.5)]}
         return described | select_measures(BRANCH_VARIANTS[variant], scores)
 
     monkeypatch.setattr(job, "train_variant", train_variant)
-    limits = {"ceiling": {"ap3d": 0.987, "ground_iou": 1.0}, "control": {"ap3d": 0.123, "ground_iou": 0.8}}
-    monkeypatch.setattr(job, "measure_limits", lambda config, root, output: limits)
     output = job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=2))
     assert trained == [(seed, variant) for seed in (0, 1) for variant in BRANCH_VARIANTS]
     job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=3))
@@ -122,12 +121,18 @@ def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys)
     assert (full["seeds"], full["steps"]) == (3, 7) and abs(full["ground_iou_mean"] - 0.91) < 1e-9
     assert (full["ground_iou_min"], full["ground_iou_max"]) == (0.9, 0.92) and bare["ap3d_mean"] == 0.5
     assert bare["ground_iou_mean"] is None and rows["without objects"]["ap3d_mean"] is None
-    assert rows["without ground"]["control_center_error_m_mean"] == 5.0
+    assert rows["without ground"]["other_latent_center_error_m_mean"] == 5.0
     printed = capsys.readouterr().out
     assert "without" in printed and "split" in printed and "40 (500)" in printed
-    assert "98.7" in printed and "12.3" in printed
+    sets = job.score_held_out(job.Branches(preset="smoke"), town_dataset, output)
+    assert sets["ceiling"]["ap3d"] > 2 * sets["control"]["ap3d"] > 0
+    assert all(f"{100 * scores['ap3d']:.3g}" in printed for scores in sets.values())
     with pytest.raises(ValueError, match="holds a study with steps=7, asked for 8"):
         job.compare_variants(job.Branches(preset="smoke", steps=8, num_seeds=2))
+    record = Path(output) / "runs/full-model-seed0.json"
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"held_out_scenes": "others"}))
+    with pytest.raises(ValueError, match=f"the held-out scenes of {town_dataset} have changed since 'full model'"):
+        job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=2))
     with pytest.raises(ValueError, match=r"--only-variants \['without sky'\]: expected some of \['full model'"):
         job.compare_variants(job.Branches(preset="smoke", steps=7, only_variants=("without sky",)))
     with pytest.raises(ValueError, match="--max-scenes is 1, expected 2 or more"):

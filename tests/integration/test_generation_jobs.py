@@ -202,9 +202,9 @@ def test_evaluate_scores_generated_scenes_and_reconstruction(smoke, samples, tmp
     made = scores["generation"]
     assert made["scenes"] == {"real": 9, "generated": 9}
     assert made["layout_frechet"]["low"] < made["layout_frechet"]["value"] < made["layout_frechet"]["high"]
-    limits = scores["reconstruction"]["limits"]
-    assert scores["reconstruction"]["ground_iou"] < limits["ceiling"]["ground_iou"]
-    assert limits["control"]["ap3d"] < 0.6 * limits["ceiling"]["ap3d"]
+    sets = scores["reconstruction"]["sets"]
+    assert scores["reconstruction"]["ground_iou"] < sets["ceiling"]["ground_iou"]
+    assert sets["control"]["ap3d"] < 0.6 * sets["ceiling"]["ap3d"]
     written = duckdb.sql(
         f"select value, low, high from '{tmp_path}/metrics.parquet' where metric = 'generation.layout_frechet'"
     ).fetchall()

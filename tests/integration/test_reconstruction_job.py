@@ -9,7 +9,7 @@ from pipelines.evaluation.reconstruction import (
     Reconstruction,
     draw_scenes,
     evaluate_reconstruction,
-    score_limits,
+    score_ceiling_and_control,
 )
 from pipelines.reporting.reconstruction_report import render_reconstruction_html, select_overall_scores
 from pipelines.schema.scene_subset import SceneSubset
@@ -59,7 +59,7 @@ def test_reconstruction_lists_best_scene_first(reconstruction_dataset, reconstru
     ids = [shard.scenes(rows)[0].scene_id for shard, rows in reconstruction.places]
     assert scenes["scene_id"].to_pylist() == ids and len(set(ids)) == 11
     assert set(scenes["primitives"].to_pylist()) == {25}
-    assert min(scenes["ground_iou"].to_pylist()) >= 0 and max(scenes["found"].to_pylist()) <= 1
+    assert min(scenes["ground_iou"].to_pylist()) >= 0 and max(scenes["matched_recall"].to_pylist()) <= 1
 
 
 def test_reconstruction_page_shows_truth_and_reconstruction(reconstruction_dataset, reconstruction):
@@ -70,8 +70,8 @@ def test_reconstruction_page_shows_truth_and_reconstruction(reconstruction_datas
             truth, again = row[f"truth_{view}"], row[f"rebuilt_{view}"]
             differs = bool((truth != again).any())
             assert truth.shape == again.shape == (480, 480, 3) and differs
-    limit = select_overall_scores(reconstruction.scores) | {"ap3d": 0.987654}
-    scores = reconstruction.scores | {"limits": {"ceiling": limit, "control": limit | {"ap3d": 0.123456}}}
+    perfect = select_overall_scores(reconstruction.scores) | {"ap3d": 0.987654}
+    scores = reconstruction.scores | {"sets": {"ceiling": perfect, "control": perfect | {"ap3d": 0.123456}}}
     html = render_reconstruction_html(scores, reconstruction.scenes, drawn[:1], drawn[1:])
     assert "0.9877" in html and "0.1235" in html
     counts = html.count("<img"), html.count('src="data:image/'), html.count("http")
@@ -81,9 +81,10 @@ def test_reconstruction_page_shows_truth_and_reconstruction(reconstruction_datas
     assert not missing
 
 
-def test_limits_of_reconstruction_are_perfect_and_damaged(reconstruction_dataset, reconstruction, tmp_path):
+def test_ceiling_is_nearly_perfect_and_control_is_damaged(reconstruction_dataset, reconstruction, tmp_path):
+    scenes = select_scenes(reconstruction_dataset)
     spec = load_lvae(str(reconstruction_dataset / "lvae")).spec
-    found = score_limits(select_scenes(reconstruction_dataset), spec, str(tmp_path))
+    found = score_ceiling_and_control(scenes, spec, str(tmp_path))
     ceiling, control = found["ceiling"], found["control"]
     assert ceiling["scenes"] == 11 and ceiling.keys() == reconstruction.scores.keys() - {"label_existence_threshold"}
     assert ceiling["ap3d"] > 0.95 and ceiling["raster_ground_iou"] > 0.999
@@ -91,8 +92,9 @@ def test_limits_of_reconstruction_are_perfect_and_damaged(reconstruction_dataset
     (lost,) = (tmp_path / "control").glob("chunk-00000.parquet")
     lost.unlink()
     written, done = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*.parquet")}, []
-    assert score_limits(select_scenes(reconstruction_dataset), spec, str(tmp_path), on_scenes=done.append) == found
+    resumed = score_ceiling_and_control(scenes, spec, str(tmp_path), on_scenes=done.append)
+    assert resumed == found
     again = {p for p, time in written.items() if p.stat().st_mtime_ns != time}
     assert sum(done) == 11 and again == {tmp_path / "ceiling/chunk-00000.parquet"} and lost.exists()
-    other = score_limits(select_scenes(reconstruction_dataset), spec.with_resolution(16), str(tmp_path))
+    other = score_ceiling_and_control(scenes, spec.with_resolution(16), str(tmp_path))
     assert other["ceiling"]["raster_px"] == 16

@@ -330,18 +330,18 @@ def test_pair_scores_equal_hand_computed():
     sums = sum_pairs(truth, found)
     got = compute_pair_scores(sums + sums)
     assert got.mean_iou3d == pytest.approx(1 / 3) and got.truth_iou3d == pytest.approx(1 / 9)
-    assert got.found == pytest.approx(1 / 3) and got.right == pytest.approx(
+    assert got.recall == pytest.approx(1 / 3) and got.precision == pytest.approx(
         1 / 2
     )  # there are three true boxes and two predicted boxes
     assert got.category_mean_iou3d == pytest.approx({"vehicle_small": 1 / 3, "vegetation_ellipsoid": 1})
-    assert got.category_found == pytest.approx({"vehicle_small": 0.5, "pole": 0, "vegetation_ellipsoid": 1})
-    assert got.category_right == pytest.approx({"vehicle_small": 0.5, "vegetation_ellipsoid": 1})
+    assert got.category_recall == pytest.approx({"vehicle_small": 0.5, "pole": 0, "vegetation_ellipsoid": 1})
+    assert got.category_precision == pytest.approx({"vehicle_small": 0.5, "vegetation_ellipsoid": 1})
 
 
 def test_pair_scores_without_pairs_or_truths_are_undefined():
     nothing = make_scene([], [])
     got = compute_pair_scores(sum_pairs(make_scene([CAR], CENTERS[:1]), nothing))
-    assert got.mean_iou3d is None and got.right is None and got.found == got.truth_iou3d == 0
+    assert got.mean_iou3d is None and got.precision is None and got.recall == got.truth_iou3d == 0
     with pytest.raises(ValueError, match="no scored category"):
         compute_pair_scores(sum_pairs(nothing, make_scene([CAR], CENTERS[:1])))
 

@@ -93,7 +93,7 @@ def test_reconstruction_of_perfect_decoder_scores_one():
     for variant in got["detection"].values():
         assert variant["ap3d"] > 0.99 and variant["ap3d_50"] > 0.99
     # The random extents of a box differ, so the scatter matrix determines the axes of the box.
-    assert got["matched"]["found"] == got["matched"]["right"] == 1 and got["matched"]["mean_iou3d"] > 0.99
+    assert got["matched"]["recall"] == got["matched"]["precision"] == 1 and got["matched"]["mean_iou3d"] > 0.99
     assert got["matched"]["category_mean_iou3d"]["vegetation_ellipsoid"] > 0.98
     assert got["voxels"]["iou"] > 0.995 and got["voxels"]["miou"] > 0.99
     assert got["height_bounds_m"] == {"low": -3.0, "high": 3.0} and got["scenes"] == 2
@@ -125,8 +125,8 @@ def test_reconstruction_counts_primitives_without_slot_as_missed():
         [make_record(scene, encode_perfectly(scene, few), few)], few, make_voxel_grid(few)
     )
     boxes = scene.category != 1
-    assert got["matched"]["found"] == pytest.approx(len(set(scene.category[boxes])) / boxes.sum())
-    assert got["matched"]["right"] == 1
+    assert got["matched"]["recall"] == pytest.approx(len(set(scene.category[boxes])) / boxes.sum())
+    assert got["matched"]["precision"] == 1
 
 
 def test_reconstruction_record_round_trips():
