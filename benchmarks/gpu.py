@@ -11,8 +11,8 @@ The script needs models/ and its packages. Where this project is not installed, 
 
 The sections:
 
-* latency: time of one scene (250 and 20 steps, batch 1) of DiT-B, L and XL after the first one, share of decoding, and
-  peak memory
+* latency: time of one scene (250 and 20 steps, batch 1) of DiT-B, L and XL after the first one, share of decoding, time
+  of the first scene, and peak memory
 * throughput: scenes per second for batches, and the share of the GPU's peak (MFU)
 * train_dit: time of a training step of DiT-B at batch 256, and MFU
 * train_lvae: time of a training step of the layout VAE at batch 32, share of matching, and MFU
@@ -188,19 +188,20 @@ def measure_memory(setup: Setup, found: dict[str, float]) -> Iterator[None]:
 # ------------------------------------------------------------------------------------------------------- sampling
 
 
-def measure_scene(setup: Setup, pipeline: PrITTIPipeline, steps: int) -> tuple[float, float]:
-    """Return the times of sampling and of decoding one scene (s), without the set-up of the first call.
+def measure_scene(setup: Setup, pipeline: PrITTIPipeline, steps: int) -> tuple[float, float, float]:
+    """Return the times of sampling the first scene and a later scene, and of decoding a scene (s).
 
-    The first call computes the modulations and captures the CUDA graph; further calls with the same timesteps and
-    labels share them.
+    The first call compiles the network, computes the modulations and captures the CUDA graph, depending on the
+    execution. Later calls with the same timesteps and labels share them.
     """
 
     def sample() -> torch.Tensor:
         return pipeline.sample_latents(["low"], 0, [0], steps)
 
+    first = setup.time_call(sample, 1, warm_up=0)
     latents, identity = sample(), pipeline.new_identity("gpu", 0, 0, "low")
     sampling = setup.time_call(sample, setup.choose(5, 2))
-    return sampling, setup.time_call(lambda: pipeline.decode(latents, [identity]), setup.choose(5, 2))
+    return first, sampling, setup.time_call(lambda: pipeline.decode(latents, [identity]), setup.choose(5, 2))
 
 
 def run_latency(setup: Setup) -> Iterator[Row]:
@@ -220,7 +221,7 @@ def run_latency(setup: Setup) -> Iterator[Row]:
             pipeline.set_execution(execution)
             with measure_memory(setup, memory):
                 for steps in (setup.choose(250, 10), setup.choose(20, 5)):
-                    sampling, decoding = measure_scene(setup, pipeline, steps)
+                    first, sampling, decoding = measure_scene(setup, pipeline, steps)
                     target, paper = "", ""
                     if steps == 250:
                         paper = PAPER_LATENCY[name]
@@ -228,6 +229,7 @@ def run_latency(setup: Setup) -> Iterator[Row]:
                     note = f"decoding {100 * decoding / (sampling + decoding):.0f} %"
                     quantity = f"{label}, one scene, {steps} steps, {kind}"
                     yield Row(quantity, sampling + decoding, "s", target, paper, note)
+                    yield Row(f"{quantity}, first scene", first, "s", note="sampling with set-up; no decoding")
             if memory:
                 target, paper = (TARGET_MEMORY, PAPER_MEMORY) if name == "kitti360" and kind == main else ("", "")
                 quantity = f"{label}, peak memory, batch 1, {kind}"
