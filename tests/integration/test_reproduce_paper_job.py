@@ -11,7 +11,7 @@ from helpers import ROOT
 
 from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
 
-SMALL = {"scale": "mini", "lvae-steps": 4, "dit-steps": 4, "num-scenes": 12, "num-inference-steps": 3}
+SMALL = {"scale": "mini", "lvae-steps": 7, "dit-steps": 4, "num-scenes": 12, "num-inference-steps": 3}
 
 
 def start_reproduction(raw: Path, output: Path, *more: str) -> subprocess.Popen[str]:
@@ -28,12 +28,19 @@ def reproduce(raw: Path, output: Path, *more: str) -> str:
     return printed
 
 
-def stop_at_line(text: str, raw: Path, output: Path) -> None:
-    """Send SIGTERM to the job when it prints a line with a text."""
-    process = start_reproduction(raw, output)
-    assert process.stdout is not None and any(text in line for line in process.stdout)
+def stop_at_line(text: str, raw: Path, output: Path) -> list[str]:
+    """Send SIGTERM to the job when it prints a line with a text, and return the lines before it."""
+    process, before = start_reproduction(raw, output), []
+    assert process.stdout is not None
+    for line in process.stdout:
+        if text in line:
+            break
+        before.append(line)
+    else:
+        pytest.fail(f"no line has {text!r}:\n" + "".join(before[-50:]))
     process.terminate()
     assert "run the same command again to resume" in process.communicate()[0] and process.returncode != 0
+    return before
 
 
 def read_times(output: Path) -> dict[Path, int]:
@@ -54,9 +61,9 @@ def test_rehearsal_resumes_and_second_call_repeats_nothing(tmp_path):
         write_kitti360(generate_town(seed), tmp_path / "raw", seed=seed)
     output = tmp_path / "out"
     stop_at_line("[1/8]", tmp_path / "raw", output)
-    stop_at_line("1 worker, from step 0", tmp_path / "raw", output)
+    stop_at_line("step 5/7", tmp_path / "raw", output)  # Checkpoints are written after 4 and 7 steps.
     tables = read_times(output / "datasets")
-    stop_at_line("[5/8]", tmp_path / "raw", output)
+    assert any("1 worker, from step 4" in line for line in stop_at_line("[5/8]", tmp_path / "raw", output))
     weights = read_times(output / "runs")
     assert tables and weights
     assert "[8/8] write the tables" in reproduce(tmp_path / "raw", output)
