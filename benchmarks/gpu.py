@@ -1,6 +1,6 @@
 """Measure sampling and training of the paper's networks on a GPU, without Ray and without internet access.
 
-    python benchmarks/gpu.py --output DIR --scenes town.safetensors        all sections; `learn` stops after 8 minutes
+    python benchmarks/gpu.py --output DIR --scenes town.safetensors        all sections; `learn` takes up to 8 minutes
     python benchmarks/gpu.py --output DIR --only latency train_dit
     python benchmarks/gpu.py --output DIR --only learn --scenes town.safetensors      continues where it stopped
     python benchmarks/gpu.py --output DIR --cpu                    rehearsal with tiny networks, a minute
@@ -11,8 +11,8 @@ The script needs models/ and its packages. Where this project is not installed, 
 
 The sections:
 
-* latency: time of one scene (250 and 20 steps, batch 1) of DiT-B, L and XL after the first one, share of decoding, time
-  of the first scene, and peak memory
+* latency: time of a scene with 250 and with 20 steps (batch 1; DiT-B, L and XL) after a first scene, share of decoding,
+  time of that first scene, and peak memory
 * throughput: scenes per second for batches, and the share of the GPU's peak (MFU)
 * train_dit: time of a training step of DiT-B at batch 256, and MFU
 * train_lvae: time of a training step of the layout VAE at batch 32, share of matching, and MFU
@@ -229,7 +229,7 @@ def run_latency(setup: Setup) -> Iterator[Row]:
                     note = f"decoding {100 * decoding / (sampling + decoding):.0f} %"
                     quantity = f"{label}, one scene, {steps} steps, {kind}"
                     yield Row(quantity, sampling + decoding, "s", target, paper, note)
-                    yield Row(f"{quantity}, first scene", first, "s", note="sampling with set-up; no decoding")
+                    yield Row(f"{quantity}, first scene", first, "s", note="with set-up; no decoding")
             if memory:
                 target, paper = (TARGET_MEMORY, PAPER_MEMORY) if name == "kitti360" and kind == main else ("", "")
                 quantity = f"{label}, peak memory, batch 1, {kind}"

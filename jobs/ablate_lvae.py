@@ -107,8 +107,9 @@ class Decoders(Branches):
 class Detr(Branches):
     """Compare changes of the DETR decoder or its training, without the ground branch, for equal time.
 
-    Each change is made alone, four of them are combined, and variants of the combination lack one of them or have
-    another one.
+    Each change is made alone. The variant `combined` has losses in metres, positions per cell, conditional attention
+    and auxiliary losses. Each variant `combined, X` differs from it in one change. --minutes is converted to a number
+    of steps, so the times of variants differ slightly.
     """
 
     preset: tyro.conf.Positional[str] = "kitti360-mini"

@@ -7,9 +7,9 @@
     jobs/reproduce_paper.py kitti360 --input KITTI-360 --scale mini      a rehearsal on two cores: small networks
 
 The job preprocesses the drives, trains the layout VAE, encodes latents, trains the transformers, samples scenes and
-evaluates them. It writes tables.html, tables.md and tables.json. Each row holds the paper's number and the reproduced
-number. Where they exist, it also holds a ceiling (other real scenes, or scenes converted to layout tensors and back,
-without a network) and a control (damaged scenes). A remark names missing values. First it prints the plan: the command
+evaluates them. It writes tables.html, tables.md and tables.json. Each row holds the reproduced score and, where they
+exist, the paper's number, a ceiling (other real scenes, or scenes converted to layout tensors and back, without a
+network) and a control (damaged scenes). A remark names missing values. First it prints the plan: the command
 of each stage, its time and the disk space. Run the same command again to resume after an interruption.
 """
 
@@ -47,7 +47,7 @@ class PaperOptions:
     """File of VGG16 weights for the distances to the nearest training scene, supplement G (only DiT-B on
     KITTI-360; default: none)."""
     num_workers: int = 1
-    """Number of training workers and of models that run in parallel; use one per GPU."""
+    """Number of training workers, and of actors that encode, sample and evaluate; use one per GPU."""
     lvae_steps: int | None = None
     """Number of training steps of the layout VAE (default: as in the preset; mini: 1000)."""
     dit_steps: int | None = None

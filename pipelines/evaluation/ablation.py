@@ -284,8 +284,7 @@ BRANCH_VARIANTS = {
     "without objects": Variant({"branches": "ground"}),
     "without ground": Variant({"branches": "objects"}),
 }
-# Both decoders use the same branches, latents and unit of the losses (cells). The paper's DETR decoder diverges at the
-# learning rate of the cell decoder.
+# Both decoders have the same ground branch, latents and unit of the losses (cells).
 DECODER_VARIANTS = {
     "cells": Variant({"objects": {"decoder": "cells"}}),
     "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
@@ -485,7 +484,7 @@ def build_variant_table(rows: Sequence[dict], sets: Mapping[str, Mapping]) -> Ta
     columns = ["variant", "parameters", "GFLOP", "seeds", "steps", "minutes", *names.values()]
     error, other = "median_center_error_m_mean", "other_latent_center_error_m_mean"
     if has_errors := any(row[error] is not None for row in rows):
-        columns.append("centre error (other latent), cm")
+        columns.append("centre error (other latent), m")
     cells = []
     for row in rows:
         cell: list = [row["variant"], f"{row['parameters']:,}", round(row["gflops"], 2), row["seeds"], row["steps"]]
@@ -496,7 +495,7 @@ def build_variant_table(rows: Sequence[dict], sets: Mapping[str, Mapping]) -> Ta
             known = None not in values
             cell.append("{} ({} to {})".format(*(format(100 * v, digits) for v in values)) if known else None)
         if has_errors:
-            cell.append(None if row[error] is None else f"{100 * row[error]:.0f} ({100 * row[other]:.0f})")
+            cell.append(None if row[error] is None else f"{row[error]:.2f} ({row[other]:.2f})")
         cells.append(cell)
     for name, found in sets.items():
         known = {key: None if found.get(key) is None else f"{100 * found[key]:.3g}" for key in names}

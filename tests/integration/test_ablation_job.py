@@ -123,7 +123,7 @@ def test_compare_variants_trains_each_seed_once(empty_home, town_dataset, monkey
     assert bare["ground_iou_mean"] is None and rows["without objects"]["ap3d_mean"] is None
     assert rows["without ground"]["other_latent_center_error_m_mean"] == 5.0
     printed = capsys.readouterr().out
-    assert "without" in printed and "split" in printed and "40 (500)" in printed
+    assert "without" in printed and "split" in printed and "0.40 (5.00)" in printed
     sets = job.score_held_out(job.Branches(preset="smoke"), town_dataset, output)
     assert sets["ceiling"]["ap3d"] > 2 * sets["control"]["ap3d"] > 0
     assert all(f"{100 * scores['ap3d']:.3g}" in printed for scores in sets.values())
