@@ -192,7 +192,8 @@ def measure_scene(setup: Setup, pipeline: PrITTIPipeline, steps: int) -> tuple[f
     """Return the times of sampling the first scene and a later scene, and of decoding a scene (s).
 
     The first call compiles the network, computes the modulations and captures the CUDA graph, depending on the
-    execution. Later calls with the same timesteps and labels share them.
+    execution. Later calls with the same timesteps and labels share them. A pipeline compiles its network once, so a
+    second number of steps needs no compilation.
     """
 
     def sample() -> torch.Tensor:

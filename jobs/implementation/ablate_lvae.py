@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
-import json
 import os
 import platform
 import re
@@ -186,16 +184,12 @@ def require_same_scenes(scores: dict, selection: SceneSubset) -> None:
     Raises:
         ValueError: The held-out scenes were replaced after the scores were written.
     """
-    if scores.get("held_out_scenes", digest_files(selection)) != digest_files(selection):  # Old studies lack it.
+    recorded = scores.get("held_out_scenes")  # Missing in records of earlier versions.
+    if recorded and recorded != selection.fingerprint():
         raise ValueError(
             f"the held-out scenes of {selection.root} have changed since {scores['variant']!r} was scored; "
             "use another --output (and another --name)"
         )
-
-
-def digest_files(selection: SceneSubset) -> str:
-    """Return a digest of the files and rows of selected scenes."""
-    return hashlib.sha256(json.dumps(selection.files()).encode()).hexdigest()[:16]
 
 
 def score_held_out(config: Branches, root: str, output: str) -> dict[str, dict]:
@@ -269,7 +263,7 @@ def train_variant(config: Branches, variant: str, seed: int, output: str) -> dic
     selection = select_held_out(config, root)
     reconstruction = evaluate_reconstruction(selection, model, records).scores
     described = {"variant": variant, "seed": seed, "steps": steps, "dataset": root}
-    described |= {"held_out_scenes": digest_files(selection)}
+    described |= {"held_out_scenes": selection.fingerprint()}
     trained, example = load_lvae(model), training.stream.shards[0].scenes([0])
     described |= {"parameters": trained.num_parameters(), "training_seconds": seconds}
     described |= {"gflops": count_gflops(trained, make_layout_batch(example, trained.spec))}

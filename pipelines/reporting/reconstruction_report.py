@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 import numpy as np
@@ -209,7 +211,7 @@ def build_overall_table(scores: Mapping) -> Table:
     }
     sets = [scores["sets"][name] for name in CEILING_AND_CONTROL]
     rows: list[tuple] = [
-        (OVERALL[path], find_score(scores, path), *(found.get(path) for found in sets), PAPER.get(path))
+        (OVERALL[path], _get_score(scores, path), *(found.get(path) for found in sets), PAPER.get(path))
         for path in meanings
     ]
     memory = scores["memory_bytes"]
@@ -228,19 +230,9 @@ def build_overall_table(scores: Mapping) -> Table:
     )
 
 
-def find_score(scores: Mapping, path: str) -> Any:
-    """Return a score from nested scores.
-
-    Args:
-        scores: Nested scores.
-        path: Names from the outside to the inside, with dots between them.
-
-    Returns:
-        The score.
-    """
-    for name in path.split("."):
-        scores = scores[name]
-    return scores
+def _get_score(scores: Mapping, path: str) -> Any:
+    """Return a score from nested scores. Dots separate the names of the path."""
+    return reduce(getitem, path.split("."), scores)
 
 
 def select_overall_scores(scores: Mapping) -> dict[str, float]:
@@ -252,7 +244,7 @@ def select_overall_scores(scores: Mapping) -> dict[str, float]:
     Returns:
         Scores by their paths, such as "matched.recall", except WITHOUT_CEILING.
     """
-    return {path: find_score(scores, path) for path in OVERALL if path not in WITHOUT_CEILING}
+    return {path: _get_score(scores, path) for path in OVERALL if path not in WITHOUT_CEILING}
 
 
 def build_category_table(scores: Mapping) -> Table:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, get_args
@@ -80,6 +82,10 @@ class SceneSubset:
         """
         prints = storage.fingerprint_files([shard.path("scenes") for shard, _ in self._shards])
         return [[*found, rows] for found, (_, rows) in zip(prints, self._shards, strict=True)]
+
+    def fingerprint(self) -> str:
+        """Return the first sixteen hexadecimal digits of the SHA-256 digest of `files`."""
+        return hashlib.sha256(json.dumps(self.files()).encode()).hexdigest()[:16]
 
     @cached_property
     def _shards(self) -> list[tuple[Shard, list[int]]]:

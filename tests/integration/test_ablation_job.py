@@ -101,7 +101,7 @@ def test_compare_variants_trains_each_seed_once(empty_home, town_dataset, monkey
         trained.append((seed, variant))
         scores = {"ground_iou": 0.9 + 0.01 * seed, "height_mse_normalised": 1e-4, "height_rmse_m": 0.1}
         described = {"variant": variant, "seed": seed, "steps": config.steps, "dataset": town_dataset, "parameters": 1}
-        held_out = job.digest_files(job.select_held_out(config, town_dataset))
+        held_out = job.select_held_out(config, town_dataset).fingerprint()
         described |= {"gflops": 0.5, "held_out_scenes": held_out}
         scores |= {"ap3d": 0.5, "ap3d_50": 0.25, "recall_1m": 0.6}
         scores |= {"median_center_error_m": 0.4, "other_latent_center_error_m": 5.0}
