@@ -34,6 +34,7 @@ import statistics
 import subprocess
 import sys
 import time
+import traceback
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -69,6 +70,7 @@ LEARN_SECONDS = 480.0
 SAVE_SECONDS = 60.0  # Interval of the checkpoints of `learn`.
 FIELDS = ("height", "occupied", "features", "real")
 MAX_SCENES_BYTES = 20_000_000
+STEPS_IN_A_ROW = 4
 HELD_OUT = 16  # Scenes of `learn` that are not trained on.
 DIT_NAMES = {"kitti360": "DiT-B", "kitti360-l": "DiT-L", "kitti360-xl": "DiT-XL"}
 # One scene with 250 steps (supplement B.3), and targets for DiT-B.
@@ -137,11 +139,15 @@ class Setup:
         return LayoutVAE(layout=self.spec(preset).to_dict(), **preset.architecture())
 
     def make_pipeline(self, name: str) -> PrITTIPipeline:
-        """Return a pipeline with random weights on the device; the encoders remain on the CPU."""
+        """Return a pipeline with random weights on the device; the encoders remain on the CPU.
+
+        Weights are drawn on the device, because the CPU needs several seconds for those of DiT-XL.
+        """
         preset = self.dit_preset(name)
         lvae = self.make_lvae(preset.lvae)
         channels, size, _ = lvae.latent_shape
-        dit = DiT(**preset.architecture(), channels=channels, size=size, layout=dict(lvae.config.layout))
+        with self.device:
+            dit = DiT(**preset.architecture(), channels=channels, size=size, layout=dict(lvae.config.layout))
         for layer in (*dit.list_modulations(), dit.patch_out):  # They are zero at the start of a training.
             torch.nn.init.normal_(layer.weight, std=0.02)
         pipeline = PrITTIPipeline(lvae, dit)
@@ -167,6 +173,19 @@ class Setup:
             if k >= warm_up:
                 seconds.append(time.perf_counter() - started)
         return statistics.median(seconds)
+
+    def time_step(self, step: Callable[[], object], repeats: int) -> float:
+        """Return the median wall-clock time of a training step (s).
+
+        Each repetition takes STEPS_IN_A_ROW steps and waits for the GPU once. As in a training, the CPU can therefore
+        prepare a step while the GPU computes the one before.
+        """
+
+        def run_steps() -> None:
+            for _ in range(STEPS_IN_A_ROW):
+                step()
+
+        return self.time_call(run_steps, repeats, warm_up=1) / STEPS_IN_A_ROW
 
     def measure_mfu(self, operations: float, seconds: float) -> float:
         """Return the share of the device's peak."""
@@ -201,7 +220,7 @@ def measure_scene(setup: Setup, pipeline: PrITTIPipeline, steps: int) -> tuple[f
 
     first = setup.time_call(sample, 1, warm_up=0)
     latents, identity = sample(), pipeline.new_identity("gpu", 0, 0, "low")
-    sampling = setup.time_call(sample, setup.choose(5, 2))
+    sampling = setup.time_call(sample, setup.choose(5, 2), warm_up=0)
     return first, sampling, setup.time_call(lambda: pipeline.decode(latents, [identity]), setup.choose(5, 2))
 
 
@@ -345,9 +364,9 @@ class Layouts:
     def __len__(self) -> int:
         return len(self.arrays["real"]) - self.num_held_out
 
-    def draw_held_out(self) -> dict[str, torch.Tensor]:
-        """Return the scenes that are never drawn for training."""
-        return {name: torch.from_numpy(value[len(self) :]).to(self.device) for name, value in self.arrays.items()}
+    def select(self, scenes: slice) -> dict[str, torch.Tensor]:
+        """Return scenes by their position in the file; those from `len(self)` are never drawn for training."""
+        return {name: torch.from_numpy(value[scenes].copy()).to(self.device) for name, value in self.arrays.items()}
 
     def draw(self, step: int, batch: int) -> dict[str, torch.Tensor]:
         """Return a batch of a step; every epoch has another order."""
@@ -379,15 +398,16 @@ def make_dit_for_training(setup: Setup, precision: str, compiled: bool = False) 
     return make_dit_trainer(dit, settings, preset.label_dropout, setup.device, execution=execution)
 
 
-def make_lvae_for_training(setup: Setup, precision: str, steps: int = 0, batch: dict | None = None) -> Trainer:
+def make_lvae_for_training(
+    setup: Setup, precision: str, steps: int = 0, batch: dict | None = None, compiled: bool = False
+) -> Trainer:
     preset, lvae = setup.lvae_preset("kitti360"), setup.make_lvae("kitti360")
     lvae.to(setup.device)
     if batch is not None and preset.init_from_data:
         lvae.init_from_data(LayoutBatch.from_compact(batch))
     settings = make_lvae_settings(replace(preset, steps=steps or preset.steps))
-    return make_lvae_trainer(
-        lvae, settings, preset.kl_weight, setup.device, execution=ExecutionConfig(precision=precision)
-    )
+    execution = ExecutionConfig(precision=precision, compile=compiled)
+    return make_lvae_trainer(lvae, settings, preset.kl_weight, setup.device, execution=execution)
 
 
 def find_fitting_batch(batch: int, attempt: Callable[[int], object]) -> int:
@@ -415,7 +435,7 @@ def count_training_step(trainer: Trainer) -> float:
 
 def run_train_dit(setup: Setup) -> Iterator[Row]:
     """Measure training steps of DiT-B."""
-    wanted = setup.choose(256, 4)
+    wanted, operations = setup.choose(256, 4), 0.0
     for compiled in (False,) if setup.tiny else (False, True):
         trainer, memory = make_dit_for_training(setup, "bf16", compiled), {}
 
@@ -426,14 +446,19 @@ def run_train_dit(setup: Setup) -> Iterator[Row]:
             trainer.step(draw_posteriors(trainer, batch), range(batch))
 
         batch = find_fitting_batch(wanted, attempt)
+        operations = operations or count_training_step(trainer)  # Compiled parts cannot be counted.
         with measure_memory(setup, memory):
-            seconds = setup.time_call(partial(step, draw_posteriors(trainer, batch)), setup.choose(10, 2))
-        mfu = setup.measure_mfu(batch * count_training_step(trainer), seconds)
-        note = ("compiled" if compiled else "not compiled") + describe_fit(wanted, batch)
+            seconds = setup.time_step(partial(step, draw_posteriors(trainer, batch)), setup.choose(5, 1))
+        mfu = setup.measure_mfu(batch * operations, seconds)
+        note = describe_execution(compiled) + describe_fit(wanted, batch)
         yield Row(f"DiT-B, training step, batch {batch}, bfloat16", seconds, "s", note=note)
         yield Row("DiT-B, MFU of training", 100 * mfu, "%", ">= 50", note=note)
         if memory:
             yield Row("DiT-B, peak memory of training", memory["peak_gb"], "GB", note=note)
+
+
+def describe_execution(compiled: bool) -> str:
+    return "compiled" if compiled else "not compiled"
 
 
 def describe_fit(wanted: int, batch: int) -> str:
@@ -443,35 +468,40 @@ def describe_fit(wanted: int, batch: int) -> str:
 
 def run_train_lvae(setup: Setup) -> Iterator[Row]:
     """Measure training steps of the layout VAE and the share of matching."""
-    wanted, matching_s = setup.choose(32, 2), []
+    wanted, operations, match = setup.choose(32, 2), 0.0, losses.match_primitives
     layouts = Layouts(setup, setup.spec(setup.lvae_preset("kitti360")))
-    trainer, memory = make_lvae_for_training(setup, "bf16"), {}
-    match = losses.match_primitives
+    for compiled in (False,) if setup.tiny else (False, True):
+        trainer, memory, matching_s = make_lvae_for_training(setup, "bf16", compiled=compiled), {}, []
 
-    def match_timed(*arguments):
-        setup.synchronise()
-        started = time.perf_counter()
-        found = match(*arguments)
-        matching_s.append(time.perf_counter() - started)
-        return found
+        def step(arrays: dict[str, torch.Tensor], trainer: Trainer = trainer) -> None:
+            trainer.step(arrays, range(len(arrays["real"])))
 
-    batch = find_fitting_batch(wanted, lambda batch: trainer.step(layouts.draw(0, batch), range(batch)))
-    arrays = layouts.draw(0, batch)
-    with measure_memory(setup, memory):
-        seconds = setup.time_call(lambda: trainer.step(arrays, range(batch)), setup.choose(10, 2))
+        def match_timed(*arguments, times: list[float] = matching_s):
+            setup.synchronise()
+            started = time.perf_counter()
+            found = match(*arguments)
+            times.append(time.perf_counter() - started)
+            return found
+
+        batch = find_fitting_batch(wanted, lambda batch, step=step: step(layouts.draw(0, batch)))
+        arrays = layouts.draw(0, batch)
+        operations = operations or count_flops(partial(step, layouts.draw(0, 1)))  # Compiled parts cannot be counted.
+        with measure_memory(setup, memory):
+            seconds = setup.time_step(partial(step, arrays), setup.choose(5, 1))
         losses.match_primitives = match_timed
         try:
-            setup.time_call(lambda: trainer.step(arrays, range(batch)), setup.choose(10, 2))
+            setup.time_step(partial(step, arrays), setup.choose(3, 1))
         finally:
             losses.match_primitives = match
-    operations = batch * count_flops(lambda: trainer.step({k: v[:1] for k, v in arrays.items()}, range(1)))
-    note = (Path(setup.scenes).name if setup.scenes else "random layouts") + describe_fit(wanted, batch)
-    share = 100 * statistics.median(matching_s) / seconds
-    yield Row(f"layout VAE, training step, batch {batch}, bfloat16", seconds, "s", note=note)
-    yield Row("layout VAE, share of matching", share, "%", "< 10", note=note)
-    yield Row("layout VAE, MFU of training", 100 * setup.measure_mfu(operations, seconds), "%", note=note)
-    if memory:
-        yield Row("layout VAE, peak memory of training", memory["peak_gb"], "GB", note=note)
+        scenes = Path(setup.scenes).name if setup.scenes else "random layouts"
+        note = f"{describe_execution(compiled)}, {scenes}{describe_fit(wanted, batch)}"
+        share = 100 * statistics.median(matching_s) / seconds
+        yield Row(f"layout VAE, training step, batch {batch}, bfloat16", seconds, "s", note=note)
+        yield Row("layout VAE, share of matching", share, "%", "< 10", note=note)
+        mfu = 100 * setup.measure_mfu(batch * operations, seconds)
+        yield Row("layout VAE, MFU of training", mfu, "%", note=note)
+        if memory:
+            yield Row("layout VAE, peak memory of training", memory["peak_gb"], "GB", note=note)
 
 
 def run_precision(setup: Setup) -> Iterator[Row]:
@@ -542,7 +572,8 @@ def run_learn(setup: Setup) -> Iterator[Row]:
         raise ValueError("learn needs --scenes FILE; make it with --write-scenes FILE")
     preset = setup.lvae_preset("kitti360")
     layouts, steps, batch = Layouts(setup, setup.spec(preset)), setup.choose(setup.steps, 4), setup.choose(32, 2)
-    trainer = make_lvae_for_training(setup, "auto", steps, layouts.draw(0, min(64, len(layouts))))
+    first_batch = layouts.draw(0, min(64, len(layouts)))
+    trainer = make_lvae_for_training(setup, "auto", steps, first_batch, compiled=not setup.tiny)
     folder = setup.output / "learn"
     if checkpoint := find_checkpoint(folder):
         trainer.load(checkpoint)
@@ -567,8 +598,10 @@ def run_learn(setup: Setup) -> Iterator[Row]:
         if curve:
             yield Row(f"learn, {name} after {trainer.steps_done} steps", curve[-1][1][name], "")
     trainer.model.eval()
-    for name, value in measure_primitives(trainer.model, layouts.draw_held_out()).items():
-        yield Row(f"learn, held out, {name} after {trainer.steps_done} steps", value, "")
+    held_out = slice(len(layouts), None)
+    for kind, scenes in (("held out", held_out), ("scenes of the training", slice(0, layouts.num_held_out))):
+        for name, value in measure_primitives(trainer.model, layouts.select(scenes)).items():
+            yield Row(f"learn, {kind}, {name} after {trainer.steps_done} steps", value, "")
     if done:
         yield Row(
             "learn, scenes per second",
@@ -632,8 +665,10 @@ def run_sections(setup: Setup, names: list[str]) -> int:
                 rows.append(vars(row))
                 print(f"  {row.quantity}: {row.value:.4g} {row.unit} {row.note}", flush=True)
             is_complete = True
-        except (ValueError, RuntimeError) as error:  # The other sections still run.
+        except Exception as error:  # The other sections still run.
             failed += 1
+            if not isinstance(error, ValueError):
+                traceback.print_exc()
             print(f"error: {name}: {error}", file=sys.stderr, flush=True)
         if rows and (is_complete or name not in results):  # Complete rows of an earlier run are kept.
             seconds = time.monotonic() - started

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from models.base import ConfiguredModel, register_to_config
 from models.batch import LayoutBatch
@@ -186,6 +186,13 @@ class LayoutVAE(ConfiguredModel):
         if not self.config.shortcut:
             return {}
         return {"ground_encoder.shortcut": 0.05, "ground_decoder.shortcut": 0.05, "ground_": 0.25}
+
+    def list_compiled_parts(self) -> list[nn.Module]:
+        """Return the modules that take most of the time: the convolutional networks and the transformer layers."""
+        parts: list[nn.Module] = [part.net for part in (self.ground_encoder, self.ground_decoder) if part]
+        for branch in (self.object_encoder, self.object_decoder):
+            parts += getattr(branch, "layers", [])  # The cell decoder has none.
+        return parts
 
     @property
     def proposes_duplicates(self) -> bool:

@@ -388,10 +388,10 @@ class PrITTIPipeline:
         shift, scale = self._moments()
         if not torch.isfinite(latents).all():  # Decoded, such a latent would give an empty scene.
             raise ValueError("a latent holds NaN or infinity: the weights of the model are damaged")
-        parts = latents.split(self.execution.decode_batch_size)
+        spec, parts = self.spec, latents.split(self.execution.decode_batch_size)
         layouts = [layout for part in parts for layout in self.lvae.decode(part * scale + shift).layouts()]
         scenes = [
-            decode_layout(layout, self.spec, identity, threshold)
+            decode_layout(layout, spec, identity, threshold)
             for layout, identity in zip(layouts, identities, strict=True)
         ]
         if not (deduplicate and self.lvae.proposes_duplicates):

@@ -271,7 +271,8 @@ def decode_layout(
         The scene on `spec.grid`.
     """
     occupied = layout.occupancy > 0.5
-    height = spec.height_bounds_m.restore(layout.height[..., None])[..., 0]
+    height = np.zeros(occupied.shape, np.float32)
+    height[occupied] = spec.height_bounds_m.restore(layout.height[occupied][:, None])[:, 0]
     kept = np.flatnonzero(layout.existence > threshold)
     rotation, size = decode_cholesky_boxes(spec.cholesky_bounds.restore(layout.features[kept, 3:]))
     rotation, size = canonicalize_boxes(rotation, size)
@@ -287,7 +288,7 @@ def decode_layout(
         instance_id=UNSET,
         label=UNSET,
         ground_classes=spec.ground_classes,
-        height_m=np.where(occupied, height, 0).astype(np.float32),
+        height_m=height,
         occupied=occupied,
         grid=spec.grid,
     )

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -93,7 +93,7 @@ class ExecutionConfig:
         accumulate: Number of parts into which a batch is split. The parts are computed one after another to save
             memory.
         precision: "fp32", "bf16" or "auto". "auto" selects bf16 if the hardware supports it, otherwise fp32.
-        compile: Use torch.compile.
+        compile: Whether torch compiles the parts of the network that take the most time.
 
     Raises:
         ValueError: A value is out of range or unknown.
@@ -202,6 +202,23 @@ def sample_noise(generators: list[torch.Generator], shape: tuple[int, ...], devi
     return torch.stack([torch.randn(shape, generator=generator) for generator in generators]).to(device)
 
 
+def sample_uniform(generators: list[torch.Generator], count: int, device: torch.device) -> Tensor:
+    """Draw random numbers between 0 and 1 with one generator per sample.
+
+    Args:
+        generators: One generator per sample.
+        count: Number of random numbers per sample.
+        device: Device of the result.
+
+    Returns:
+        (b, count) random numbers.
+    """
+    drawn = torch.stack([torch.rand(count, generator=generator) for generator in generators])
+    if device.type == "cuda":  # A copy from other memory would wait for the GPU.
+        drawn = drawn.pin_memory()
+    return drawn.to(device, non_blocking=True)
+
+
 def sample_corruption(
     generators: list[torch.Generator], shape: tuple[int, ...], spread: float, device: torch.device
 ) -> Tensor:
@@ -301,18 +318,18 @@ def make_diffusion_loss(
     """
     diffusion = dit.diffusion
     shape = (dit.config.channels, dit.config.size, dit.config.size)
-    shift = torch.tensor(dit.config.shift or [0.0] * shape[0])[:, None, None]
-    scale = torch.tensor(dit.config.scale or [1.0] * shape[0])[:, None, None]
+    shift = torch.tensor(dit.config.shift or [0.0] * shape[0], device=dit.device)[:, None, None]
+    scale = torch.tensor(dit.config.scale or [1.0] * shape[0], device=dit.device)[:, None, None]
 
     def loss(
         model: Callable[..., Any], arrays: dict[str, Tensor], generators: list[torch.Generator]
     ) -> dict[str, Tensor]:
         mean, logvar, label = arrays["mean"].float(), arrays["logvar"].float(), arrays["label"]
         device = mean.device
-        latent = mean + (0.5 * logvar).exp() * sample_noise(generators, shape, device)
-        latent = (latent - shift.to(device)) / scale.to(device)
-        noise = sample_noise(generators, shape, device)
-        uniform = torch.stack([torch.rand(2, generator=generator) for generator in generators]).to(device)
+        # Nothing here waits for a GPU. The random numbers are therefore drawn while it computes the previous step.
+        posterior_noise, noise = (sample_noise(generators, shape, device) for _ in range(2))
+        uniform = sample_uniform(generators, 2, device)
+        latent = (mean + (0.5 * logvar).exp() * posterior_noise - shift) / scale
         timestep = sample_timesteps(uniform[:, 0], timestep_sampling, diffusion.num_timesteps)
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
         predicted = model(diffusion.add_noise(latent, noise, timestep), timestep, label)
@@ -349,7 +366,7 @@ class Trainer:
         wrapped: nn.Module | None = None,
         execution: ExecutionConfig | None = None,
     ) -> None:
-        self.model, self.wrapped, self.loss = model, wrapped or model, loss
+        self.model, self.wrapped, self.loss = model, model if wrapped is None else wrapped, loss
         self.settings, self.device, self.execution = settings, device, execution or ExecutionConfig()
         if self.execution.precision == "bf16":
             require_bf16(device)
@@ -548,7 +565,9 @@ def make_lvae_trainer(
     model = model.to(device)
     groups = model.config.objects["denoising_groups"]
     loss = make_layout_loss(model.spec, model.latent_shape, kl_weight, latent_noise, groups)
-    return Trainer(model, loss, settings, device, wrap(_compile_model(model, execution)), execution)
+    if execution.compile:
+        _compile_parts(model.list_compiled_parts())
+    return Trainer(model, loss, settings, device, wrap(model), execution)
 
 
 def make_dit_trainer(
@@ -577,11 +596,15 @@ def make_dit_trainer(
     execution = execution or ExecutionConfig()
     model = model.to(device)
     loss = make_diffusion_loss(model, label_dropout, timestep_sampling)
-    return Trainer(model, loss, settings, device, wrap(_compile_model(model, execution)), execution)
+    if execution.compile:
+        _compile_parts(model.blocks)
+    return Trainer(model, loss, settings, device, wrap(model), execution)
 
 
-def _compile_model(model: nn.Module, execution: ExecutionConfig) -> nn.Module:
-    return cast(nn.Module, torch.compile(model)) if execution.compile else model
+def _compile_parts(parts: Iterable[nn.Module]) -> None:
+    """Compile modules in place. Modules of the same class and shapes share the compiled code."""
+    for part in parts:
+        part.compile(fullgraph=True)
 
 
 def count_flops(call: Callable[[], object]) -> float:

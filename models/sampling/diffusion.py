@@ -84,8 +84,14 @@ class Diffusion:
         Returns:
             Noisy latents z_t.
         """
-        alpha_bar = torch.from_numpy(self.alpha_bar).to(clean.device)[timestep][:, None, None, None]
+        alpha_bar = _copy_alpha_bar(self, clean.device)[timestep][:, None, None, None]
         return alpha_bar.sqrt().to(clean.dtype) * clean + (1 - alpha_bar).sqrt().to(clean.dtype) * noise
+
+
+@cache
+def _copy_alpha_bar(diffusion: Diffusion, device: torch.device) -> Tensor:
+    """Copy alpha_bar to a device once, because each copy would wait for a GPU."""
+    return torch.from_numpy(diffusion.alpha_bar).to(device)
 
 
 PAPER_SCHEDULE = Diffusion()

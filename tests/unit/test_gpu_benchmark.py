@@ -151,7 +151,7 @@ def test_scenes_of_a_file_are_held_out(tmp_path):
     path = tmp_path / "town.safetensors"
     gpu.write_scenes(path, 8)
     layouts = gpu.Layouts(gpu.Setup(torch.device("cpu"), False, 1.0, tmp_path, str(path), 1), LayoutSpec())
-    held = layouts.draw_held_out()["features"]
+    held = layouts.select(slice(len(layouts), None))["features"]
     drawn = layouts.draw(0, len(layouts))["features"]
     assert (len(layouts), len(held)) == (6, 2)
     assert not any(torch.equal(one, other) for one in held for other in drawn)
