@@ -226,7 +226,7 @@ def measure_scene(setup: Setup, pipeline: PrITTIPipeline, steps: int) -> tuple[f
 
 def run_latency(setup: Setup) -> Iterator[Row]:
     """Measure the time of one scene."""
-    main = "bfloat16, CUDA graph"
+    main, small = "bfloat16, CUDA graph", "kitti360"
     executions = {
         "float32": SamplingExecution(),
         "bfloat16": SamplingExecution("bf16"),
@@ -237,6 +237,8 @@ def run_latency(setup: Setup) -> Iterator[Row]:
         del executions[f"{main}, compiled"]  # Compiling takes longer than the rehearsal.
     for name, label in DIT_NAMES.items():
         for kind, execution in executions.items():
+            if name != small and main not in kind and not setup.tiny:
+                continue  # The large networks are measured with the fast executions only.
             pipeline, memory = setup.make_pipeline(name), {}
             pipeline.set_execution(execution)
             with measure_memory(setup, memory):
@@ -245,13 +247,13 @@ def run_latency(setup: Setup) -> Iterator[Row]:
                     target, paper = "", ""
                     if steps == 250:
                         paper = PAPER_LATENCY[name]
-                        target = TARGET_LATENCY if main in kind and name == "kitti360" else ""
+                        target = TARGET_LATENCY if main in kind and name == small else ""
                     note = f"decoding {100 * decoding / (sampling + decoding):.0f} %"
                     quantity = f"{label}, one scene, {steps} steps, {kind}"
                     yield Row(quantity, sampling + decoding, "s", target, paper, note)
                     yield Row(f"{quantity}, first scene", first, "s", note="with set-up; no decoding")
             if memory:
-                target, paper = (TARGET_MEMORY, PAPER_MEMORY) if name == "kitti360" and kind == main else ("", "")
+                target, paper = (TARGET_MEMORY, PAPER_MEMORY) if name == small and kind == main else ("", "")
                 quantity = f"{label}, peak memory, batch 1, {kind}"
                 yield Row(quantity, memory["peak_gb"], "GB", target, paper, "without encoders")
 
@@ -633,9 +635,10 @@ def describe_device(device: torch.device) -> str:
             command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
             name += f", driver {subprocess.check_output(command, text=True).split()[0]}"
     commit = os.environ.get("COMMIT", "")
-    with suppress(OSError, subprocess.CalledProcessError):
-        command = ["git", "-C", str(ROOT), "rev-parse", "--short=10", "HEAD"]
-        commit = subprocess.check_output(command, text=True, stderr=subprocess.DEVNULL).strip()
+    if not commit:
+        with suppress(OSError, subprocess.CalledProcessError):
+            command = ["git", "-C", str(ROOT), "rev-parse", "--short=10", "HEAD"]
+            commit = subprocess.check_output(command, text=True, stderr=subprocess.DEVNULL).strip()
     return f"{name}, torch {torch.__version__}, CUDA {torch.version.cuda}, Python {platform.python_version()}, {commit}"
 
 
@@ -656,7 +659,7 @@ def run_sections(setup: Setup, names: list[str]) -> int:
     setup.output.mkdir(parents=True, exist_ok=True)
     results = json.loads(path.read_text()) if path.exists() else {}
     for name in names:
-        started, rows, is_complete = time.monotonic(), [], False
+        started, rows, is_complete, stopped = time.monotonic(), [], False, False
         print(f"{name}:", flush=True)
         try:
             for row in SECTIONS[name](setup):
@@ -670,12 +673,17 @@ def run_sections(setup: Setup, names: list[str]) -> int:
             if not isinstance(error, ValueError):
                 traceback.print_exc()
             print(f"error: {name}: {error}", file=sys.stderr, flush=True)
+        except KeyboardInterrupt:
+            stopped = True
+            print(f"{name}: stopped", file=sys.stderr, flush=True)
         if rows and (is_complete or name not in results):  # Complete rows of an earlier run are kept.
             seconds = time.monotonic() - started
             results[name] = {"machine": describe_device(setup.device), "seconds": round(seconds, 1), "rows": rows}
         results = {section: results[section] for section in SECTIONS if section in results}
         path.write_text(json.dumps(results, indent=1) + "\n")
         (setup.output / "gpu.md").write_text(format_table(results))
+        if stopped:
+            return failed + 1
     return failed
 
 

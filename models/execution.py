@@ -9,7 +9,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -62,10 +61,8 @@ class SamplingExecution:
             require_bf16(dit.device)
             dit.blocks.to(torch.bfloat16)
         if self.compile:
-            # One scene has few tokens. By default, the compiler would split each normalisation into three kernels.
-            options: dict[str, Any] = {"split_reductions": False}
             for block in dit.blocks:
-                block.compile(fullgraph=True, dynamic=False, options=options)
+                block.compile(fullgraph=True, dynamic=False)
 
     def autocast(self, device: torch.device) -> torch.autocast:
         """Return the context in which the network runs.

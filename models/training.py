@@ -186,20 +186,24 @@ class NonFiniteLossError(ValueError):
 LossFunction = Callable[[Callable[..., Any], dict[str, Tensor], list[torch.Generator]], dict[str, Tensor]]
 
 
-def sample_noise(generators: list[torch.Generator], shape: tuple[int, ...], device: torch.device) -> Tensor:
+def sample_noise(
+    generators: list[torch.Generator], shape: tuple[int, ...], device: torch.device, count: int = 1
+) -> Tensor:
     """Draw standard normal noise with one generator per sample.
 
     Args:
         generators: One generator per sample.
         shape: Shape of the noise of one sample.
         device: Device of the result.
+        count: Number of draws of each sample, one after another.
 
     Returns:
-        (b, *shape) noise.
+        (count, b, *shape) noise.
     """
     if device.type == "cuda":  # For large batches, one thread would need longer than the GPU for the step.
-        return finish_drawing(*start_drawing(generators, shape, device), device)
-    return torch.stack([torch.randn(shape, generator=generator) for generator in generators]).to(device)
+        return finish_drawing(*start_drawing(generators, shape, device, count), device)
+    drawn = [[torch.randn(shape, generator=generator) for generator in generators] for _ in range(count)]
+    return torch.stack([torch.stack(one) for one in drawn]).to(device)
 
 
 def sample_uniform(generators: list[torch.Generator], count: int, device: torch.device) -> Tensor:
@@ -262,10 +266,10 @@ def make_layout_loss(
     ) -> dict[str, Tensor]:
         device = arrays["real"].device
         batch = LayoutBatch.from_compact(arrays)
-        noise = sample_noise(generators, latent_shape, device)
+        (noise,) = sample_noise(generators, latent_shape, device)
         corruption = sample_corruption(generators, latent_shape, latent_noise, device) if latent_noise else None
         query_shape = (denoising_groups, spec.num_slots, FEATURES)
-        query_noise = sample_noise(generators, query_shape, device) if denoising_groups else None
+        query_noise = sample_noise(generators, query_shape, device)[0] if denoising_groups else None
         output, posterior = model(batch, noise, corruption, query_noise)
         with torch.autocast(device.type, enabled=False):  # Losses and matching costs are computed in float32.
             output, posterior = output.float(), posterior.float()
@@ -327,7 +331,7 @@ def make_diffusion_loss(
         mean, logvar, label = arrays["mean"].float(), arrays["logvar"].float(), arrays["label"]
         device = mean.device
         # Nothing here waits for a GPU. The random numbers are therefore drawn while it computes the previous step.
-        posterior_noise, noise = (sample_noise(generators, shape, device) for _ in range(2))
+        posterior_noise, noise = sample_noise(generators, shape, device, count=2)
         uniform = sample_uniform(generators, 2, device)
         latent = (mean + (0.5 * logvar).exp() * posterior_noise - shift) / scale
         timestep = sample_timesteps(uniform[:, 0], timestep_sampling, diffusion.num_timesteps)

@@ -68,9 +68,8 @@ class ReconstructionCheck:
         for start in range(0, len(scenes), self.batch):
             chosen = scenes[start : start + self.batch]
             batch = make_layout_batch(chosen, spec).to(trainer.device)
-            noise = sample_noise(
-                [make_keyed_generator(0, start + k) for k in range(len(chosen))], model.latent_shape, trainer.device
-            )
+            generators = [make_keyed_generator(0, start + k) for k in range(len(chosen))]
+            (noise,) = sample_noise(generators, model.latent_shape, trainer.device)
             output, posterior = model(batch, noise)
             parts = compute_lvae_loss(output, posterior, batch, spec, self.kl_weight).items()
             losses.append({name: float(value) * len(chosen) for name, value in parts.items()})

@@ -178,31 +178,36 @@ GENERATE, OUTPAINT, INPAINT = 1, 2, 3
 @cache
 def start_noise_threads() -> ThreadPoolExecutor:
     """Return the threads that draw noise for GPUs; they start with the first draw."""
-    return ThreadPoolExecutor(min(8, os.cpu_count() or 1), "noise")
+    return ThreadPoolExecutor(min(16, os.cpu_count() or 1), "noise")
 
 
 def start_drawing(
-    generators: Sequence[torch.Generator], shape: tuple[int, ...], device: torch.device
-) -> tuple[Float[Tensor, "b ..."], list[Future]]:
+    generators: Sequence[torch.Generator], shape: tuple[int, ...], device: torch.device, count: int = 1
+) -> tuple[Float[Tensor, "count b ..."], list[Future]]:
     """Start to draw standard normal noise in threads, with one generator per sample.
 
     Args:
         generators: Generators of the CPU.
         shape: Shape of the noise of one sample.
         device: Device that will use the noise. Copies from pinned memory to a GPU do not wait for the GPU.
+        count: Number of draws of each sample, one after another.
 
     Returns:
         Memory of the CPU for the noise, and one future per sample. The noise is complete when all futures are done.
     """
-    noise = torch.empty((len(generators), *shape), pin_memory=device.type == "cuda")
+    noise = torch.empty((count, len(generators), *shape), pin_memory=device.type == "cuda")
+
+    def draw(sample: int) -> None:
+        for part in noise[:, sample]:
+            torch.randn(shape, generator=generators[sample], out=part)
+
     threads = start_noise_threads()
-    parts = zip(generators, noise, strict=True)
-    return noise, [threads.submit(torch.randn, shape, generator=g, out=part) for g, part in parts]
+    return noise, [threads.submit(draw, sample) for sample in range(len(generators))]
 
 
 def finish_drawing(
-    noise: Float[Tensor, "b ..."], parts: Sequence[Future], device: torch.device
-) -> Float[Tensor, "b ..."]:
+    noise: Float[Tensor, "count b ..."], parts: Sequence[Future], device: torch.device
+) -> Float[Tensor, "count b ..."]:
     """Wait for the noise of `start_drawing`.
 
     Args:
@@ -254,7 +259,7 @@ class SceneNoise:
         if self.next is None:
             noise = torch.stack([torch.randn(self.shape, generator=generator) for generator in self.generators])
             return noise.to(self.device)
-        noise = finish_drawing(*self.next, self.device)
+        noise = finish_drawing(*self.next, self.device)[0]
         self.next = self._start()
         return noise
 

@@ -41,8 +41,11 @@ def test_training_noise_of_threads_is_the_same_noise():
         return [make_keyed_generator(0, k) for k in range(5)]
 
     device = torch.device("cpu")
-    expected = sample_noise(make_generators(), (4, 8, 8), device)
-    assert torch.equal(finish_drawing(*start_drawing(make_generators(), (4, 8, 8), device), device), expected)
+    expected = sample_noise(make_generators(), (4, 8, 8), device, count=2)
+    assert expected.shape == (2, 5, 4, 8, 8) and not torch.equal(*expected)
+    assert torch.equal(finish_drawing(*start_drawing(make_generators(), (4, 8, 8), device, 2), device), expected)
+    one_by_one = make_generators()
+    assert torch.equal(torch.cat([sample_noise(one_by_one, (4, 8, 8), device) for _ in range(2)]), expected)
 
 
 def test_replayed_denoiser_gives_equal_latents(monkeypatch):
