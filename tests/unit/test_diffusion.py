@@ -261,7 +261,7 @@ def test_trainer_accumulated_parts_equal_whole_step(parts):
         assert torch.allclose(value, cut.model.state_dict()[name], atol=2e-5), name
 
 
-def test_trainer_bf16_and_compile_compute_same_loss():
+def test_trainer_in_bf16_computes_the_same_loss():
     batch = make_dit_batch()
     plain = float(make_trainer().step(batch, range(8))["loss"])
     half = make_trainer(execution=ExecutionConfig(precision="bf16"))
