@@ -6,7 +6,7 @@
 The projects are KITTI-360, 1,000 logs of Argoverse 2, 60,000 generated scenes with their evaluation, and a city. CPU
 time, requests and bytes per unit are measured (cost_rates.py). GPU time is calculated: the script counts the
 floating-point operations of the paper's networks and divides them by the peak of a GPU times an assumed utilisation.
-No GPU was measured. Prices are options. The prices by default are rounded list prices; they differ between providers.
+Prices are options. The prices by default are rounded list prices; they differ between providers.
 """
 
 from __future__ import annotations

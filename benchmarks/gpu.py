@@ -12,20 +12,22 @@ The script needs models/ and its packages. Where this project is not installed, 
 The sections:
 
 * latency: time of a scene with 250 and with 20 steps (batch 1; DiT-B, L and XL) after a first scene, share of decoding,
-  time of that first scene, and peak memory
-* throughput: scenes per second for batches, and the share of the GPU's peak (MFU)
-* train_dit: time of a training step of DiT-B at batch 256, and MFU
-* train_lvae: time of a training step of the layout VAE at batch 32, share of matching, and MFU
+  time of that first scene, and peak memory; without a CUDA graph only for DiT-B
+* throughput: denoising steps of batches, and the share of the GPU's peak (MFU)
+* train_dit, train_lvae: time, MFU and peak memory of a training step (DiT-B at batch 256, layout VAE at batch 32),
+  compiled and not compiled; share of matching for nearly untrained weights and for predictions near the truth
 * precision: losses of 200 steps in bfloat16 and in float32, from the same weights, noise and data
 * learn: training of a layout VAE with the DETR decoder on town scenes, of which 16 are held out and scored
 
-Each section adds its rows to DIR/gpu.json and writes DIR/gpu.md. Weights are random except in `learn`. MFU divides the
-operations that torch counts by the time and by --peak-tflops (H100, bfloat16: 989).
+Each section adds its rows to DIR/gpu.json and writes DIR/gpu.md, with the commit that git finds or that the environment
+variable COMMIT states. Weights are random except in `learn`. MFU divides the operations that torch counts by the time
+and by --peak-tflops (H100 and H200, bfloat16: 989). Training batches are already on the GPU.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import platform
@@ -41,6 +43,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -70,12 +73,13 @@ LEARN_SECONDS = 480.0
 SAVE_SECONDS = 60.0  # Interval of the checkpoints of `learn`.
 FIELDS = ("height", "occupied", "features", "real")
 MAX_SCENES_BYTES = 20_000_000
-STEPS_IN_A_ROW = 4
+STEPS_IN_A_ROW = 4  # Training steps between two waits for the GPU.
 HELD_OUT = 16  # Scenes of `learn` that are not trained on.
 DIT_NAMES = {"kitti360": "DiT-B", "kitti360-l": "DiT-L", "kitti360-xl": "DiT-XL"}
-# One scene with 250 steps (supplement B.3), and targets for DiT-B.
-PAPER_LATENCY = {"kitti360": "0.58 (A100)", "kitti360-l": "1.78 (A100)", "kitti360-xl": "2.11 (A100)"}
-TARGET_LATENCY, TARGET_MEMORY, PAPER_MEMORY = "<= 0.15", "<= 0.6", "0.89 (A100)"
+# One scene with 250 steps (table of generation results), and targets for DiT-B. The paper does not state the GPU of its
+# times and of its memory.
+PAPER_LATENCY = {"kitti360": "0.58", "kitti360-l": "1.78", "kitti360-xl": "2.11"}
+TARGET_LATENCY, TARGET_MEMORY, PAPER_MEMORY = "<= 0.15", "<= 0.6", "0.89"
 
 
 @dataclass(frozen=True)
@@ -123,27 +127,30 @@ class Setup:
         """Return a count for the full run or for the rehearsal."""
         return tiny if self.tiny else full
 
-    def dit_preset(self, name: str) -> DiTPreset:
+    def find_dit_preset(self, name: str) -> DiTPreset:
+        """Return a preset, with a tiny network in the rehearsal."""
         preset = DIT_PRESETS[name]
         return replace(preset, model=DiTConfig(2, 2, 32, 2)) if self.tiny else preset
 
-    def lvae_preset(self, name: str) -> LVAEPreset:
+    def find_lvae_preset(self, name: str) -> LVAEPreset:
+        """Return a preset; in the rehearsal, the smallest one."""
         return LVAE_PRESETS["smoke" if self.tiny else name]
 
-    def spec(self, preset: LVAEPreset) -> LayoutSpec:
+    def make_spec(self, preset: LVAEPreset) -> LayoutSpec:
+        """Return the layout of scenes with the rasters of a preset."""
         return LayoutSpec().with_resolution(preset.raster_px)
 
     def make_lvae(self, name: str) -> LayoutVAE:
-        preset = self.lvae_preset(name)
+        preset = self.find_lvae_preset(name)
         torch.manual_seed(0)
-        return LayoutVAE(layout=self.spec(preset).to_dict(), **preset.architecture())
+        return LayoutVAE(layout=self.make_spec(preset).to_dict(), **preset.architecture())
 
     def make_pipeline(self, name: str) -> PrITTIPipeline:
         """Return a pipeline with random weights on the device; the encoders remain on the CPU.
 
         Weights are drawn on the device, because the CPU needs several seconds for those of DiT-XL.
         """
-        preset = self.dit_preset(name)
+        preset = self.find_dit_preset(name)
         lvae = self.make_lvae(preset.lvae)
         channels, size, _ = lvae.latent_shape
         with self.device:
@@ -177,8 +184,8 @@ class Setup:
     def time_step(self, step: Callable[[], object], repeats: int) -> float:
         """Return the median wall-clock time of a training step (s).
 
-        Each repetition takes STEPS_IN_A_ROW steps and waits for the GPU once. As in a training, the CPU can therefore
-        prepare a step while the GPU computes the one before.
+        Each repetition takes STEPS_IN_A_ROW steps and waits for the GPU at its end. The trainer itself waits for the
+        loss of each step, and prepares the next step during the backward pass, as in a training.
         """
 
         def run_steps() -> None:
@@ -197,6 +204,7 @@ def measure_memory(setup: Setup, found: dict[str, float]) -> Iterator[None]:
     """Store the peak of allocated GPU memory (GB), with the weights, under "peak_gb"; nothing on a CPU."""
     if setup.device.type == "cuda":
         torch.cuda.synchronize(setup.device)
+        gc.collect()  # Compiled networks are parts of reference cycles.
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(setup.device)
     yield
@@ -226,18 +234,18 @@ def measure_scene(setup: Setup, pipeline: PrITTIPipeline, steps: int) -> tuple[f
 
 def run_latency(setup: Setup) -> Iterator[Row]:
     """Measure the time of one scene."""
-    main, small = "bfloat16, CUDA graph", "kitti360"
+    graphs, base = "bfloat16, CUDA graph", "kitti360"
     executions = {
         "float32": SamplingExecution(),
         "bfloat16": SamplingExecution("bf16"),
-        main: SamplingExecution("bf16", cuda_graphs=True),
-        f"{main}, compiled": SamplingExecution("bf16", cuda_graphs=True, compile=True),
+        graphs: SamplingExecution("bf16", cuda_graphs=True),
+        f"{graphs}, compiled": SamplingExecution("bf16", cuda_graphs=True, compile=True),
     }
     if setup.tiny:
-        del executions[f"{main}, compiled"]  # Compiling takes longer than the rehearsal.
+        del executions[f"{graphs}, compiled"]  # Compiling takes longer than the rehearsal.
     for name, label in DIT_NAMES.items():
         for kind, execution in executions.items():
-            if name != small and main not in kind and not setup.tiny:
+            if name != base and graphs not in kind and not setup.tiny:
                 continue  # The large networks are measured with the fast executions only.
             pipeline, memory = setup.make_pipeline(name), {}
             pipeline.set_execution(execution)
@@ -247,13 +255,13 @@ def run_latency(setup: Setup) -> Iterator[Row]:
                     target, paper = "", ""
                     if steps == 250:
                         paper = PAPER_LATENCY[name]
-                        target = TARGET_LATENCY if main in kind and name == small else ""
+                        target = TARGET_LATENCY if graphs in kind and name == base else ""
                     note = f"decoding {100 * decoding / (sampling + decoding):.0f} %"
                     quantity = f"{label}, one scene, {steps} steps, {kind}"
                     yield Row(quantity, sampling + decoding, "s", target, paper, note)
                     yield Row(f"{quantity}, first scene", first, "s", note="with set-up; no decoding")
             if memory:
-                target, paper = (TARGET_MEMORY, PAPER_MEMORY) if name == small and kind == main else ("", "")
+                target, paper = (TARGET_MEMORY, PAPER_MEMORY) if name == base and kind == graphs else ("", "")
                 quantity = f"{label}, peak memory, batch 1, {kind}"
                 yield Row(quantity, memory["peak_gb"], "GB", target, paper, "without encoders")
 
@@ -279,8 +287,8 @@ def run_throughput(setup: Setup) -> Iterator[Row]:
             denoise = pipeline.make_denoiser(torch.tensor([500]), classes)
             seconds = setup.time_call(partial(denoise, latent, timestep, classes), setup.choose(20, 3), 3)
             rate, mfu = batch / (250 * seconds), setup.measure_mfu(batch * operations, seconds)
-            note = "250 steps, extrapolated from one; no decoding"
-            yield Row(f"{label}, sampling, batch {batch}", rate, "scenes/s", note=note)
+            note = "250 times one step; no noise, sampler or decoding"
+            yield Row(f"{label}, network of sampling, batch {batch}", rate, "scenes/s", note=note)
             yield Row(f"{label}, MFU of a denoising step, batch {batch}", 100 * mfu, "%")
 
 
@@ -392,7 +400,8 @@ def draw_posteriors(trainer: Trainer, batch: int, seed: int = 0) -> dict[str, to
 
 
 def make_dit_for_training(setup: Setup, precision: str, compiled: bool = False) -> Trainer:
-    preset, shape = setup.dit_preset("kitti360"), setup.make_lvae("kitti360").latent_shape
+    """Return a trainer of DiT-B with equal initial weights in each call."""
+    preset, shape = setup.find_dit_preset("kitti360"), setup.make_lvae("kitti360").latent_shape
     torch.manual_seed(0)
     dit = DiT(**preset.architecture(), channels=shape[0], size=shape[1])
     settings = make_dit_settings(preset)
@@ -403,7 +412,7 @@ def make_dit_for_training(setup: Setup, precision: str, compiled: bool = False) 
 def make_lvae_for_training(
     setup: Setup, precision: str, steps: int = 0, batch: dict | None = None, compiled: bool = False
 ) -> Trainer:
-    preset, lvae = setup.lvae_preset("kitti360"), setup.make_lvae("kitti360")
+    preset, lvae = setup.find_lvae_preset("kitti360"), setup.make_lvae("kitti360")
     lvae.to(setup.device)
     if batch is not None and preset.init_from_data:
         lvae.init_from_data(LayoutBatch.from_compact(batch))
@@ -468,11 +477,29 @@ def describe_fit(wanted: int, batch: int) -> str:
     return f"; batch {wanted} does not fit in the memory, {batch} fits" if batch < wanted else ""
 
 
+def measure_matching(setup: Setup, step: Callable[[], object]) -> float:
+    """Return the median time of matching within training steps (s), with the work of the GPU."""
+    match, seconds = losses.match_primitives, []
+
+    def match_timed(*arguments):
+        setup.synchronise()
+        started = time.perf_counter()
+        found = match(*arguments)
+        seconds.append(time.perf_counter() - started)
+        return found
+
+    losses.match_primitives = match_timed
+    try:
+        setup.time_step(step, setup.choose(3, 1))
+    finally:
+        losses.match_primitives = match
+    return statistics.median(seconds)
+
+
 def make_matching_near_truth(arrays: dict[str, torch.Tensor], spec: LayoutSpec) -> Callable[[], object]:
     """Return a call that matches the primitives of layouts with noisy copies (2 % of the range of each feature).
 
-    Predictions of untrained weights are nearly equal for all primitives, so their matching takes longer than later in
-    a training.
+    Predictions of untrained weights are nearly equal for all primitives, so they are matched more slowly.
     """
     batch = LayoutBatch.from_compact(arrays)
     near = (batch.features + 0.02 * torch.randn_like(batch.features)).clamp(0, 1)
@@ -482,36 +509,25 @@ def make_matching_near_truth(arrays: dict[str, torch.Tensor], spec: LayoutSpec) 
 
 def run_train_lvae(setup: Setup) -> Iterator[Row]:
     """Measure training steps of the layout VAE and the share of matching."""
-    wanted, operations, match = setup.choose(32, 2), 0.0, losses.match_primitives
-    layouts = Layouts(setup, setup.spec(setup.lvae_preset("kitti360")))
+    wanted, operations = setup.choose(32, 2), 0.0
+    layouts = Layouts(setup, setup.make_spec(setup.find_lvae_preset("kitti360")))
     for compiled in (False,) if setup.tiny else (False, True):
-        trainer, memory, matching_s = make_lvae_for_training(setup, "bf16", compiled=compiled), {}, []
+        trainer, memory = make_lvae_for_training(setup, "bf16", compiled=compiled), {}
 
         def step(arrays: dict[str, torch.Tensor], trainer: Trainer = trainer) -> None:
             trainer.step(arrays, range(len(arrays["real"])))
-
-        def match_timed(*arguments, times: list[float] = matching_s):
-            setup.synchronise()
-            started = time.perf_counter()
-            found = match(*arguments)
-            times.append(time.perf_counter() - started)
-            return found
 
         batch = find_fitting_batch(wanted, lambda batch, step=step: step(layouts.draw(0, batch)))
         arrays = layouts.draw(0, batch)
         operations = operations or count_flops(partial(step, layouts.draw(0, 1)))  # Compiled parts cannot be counted.
         with measure_memory(setup, memory):
             seconds = setup.time_step(partial(step, arrays), setup.choose(5, 1))
-        losses.match_primitives = match_timed
-        try:
-            setup.time_step(partial(step, arrays), setup.choose(3, 1))
-        finally:
-            losses.match_primitives = match
+        matching_s = measure_matching(setup, partial(step, arrays))
         scenes = Path(setup.scenes).name if setup.scenes else "random layouts"
         note = f"{describe_execution(compiled)}, {scenes}{describe_fit(wanted, batch)}"
         near_s = setup.time_call(make_matching_near_truth(arrays, layouts.spec), setup.choose(5, 1))
         yield Row(f"layout VAE, training step, batch {batch}, bfloat16", seconds, "s", note=note)
-        for kind, spent in (("untrained weights", statistics.median(matching_s)), ("predictions near truth", near_s)):
+        for kind, spent in (("nearly untrained weights", matching_s), ("predictions near truth", near_s)):
             yield Row(f"layout VAE, share of matching, {kind}", 100 * spent / seconds, "%", "< 10", note=note)
         mfu = 100 * setup.measure_mfu(batch * operations, seconds)
         yield Row("layout VAE, MFU of training", mfu, "%", note=note)
@@ -522,7 +538,7 @@ def run_train_lvae(setup: Setup) -> Iterator[Row]:
 def run_precision(setup: Setup) -> Iterator[Row]:
     """Compare the losses of trainings in bfloat16 and in float32."""
     steps, last = setup.choose(200, 6), setup.choose(50, 3)
-    layouts = Layouts(setup, setup.spec(setup.lvae_preset("kitti360")))
+    layouts = Layouts(setup, setup.make_spec(setup.find_lvae_preset("kitti360")))
     sizes = {"DiT-B": setup.choose(32, 2), "layout VAE": setup.choose(8, 2)}
     for name, batch in sizes.items():
         curves = {}
@@ -582,11 +598,14 @@ def save_checkpoint(trainer: Trainer, folder: Path) -> None:
 
 
 def run_learn(setup: Setup) -> Iterator[Row]:
-    """Train a layout VAE on the scenes for at most LEARN_SECONDS, from the last checkpoint."""
+    """Train a layout VAE on the scenes, from the last checkpoint.
+
+    The training ends a minute before LEARN_SECONDS, so there is time to save and to score.
+    """
     if not setup.scenes and not setup.tiny:
         raise ValueError("learn needs --scenes FILE; make it with --write-scenes FILE")
-    preset = setup.lvae_preset("kitti360")
-    layouts, steps, batch = Layouts(setup, setup.spec(preset)), setup.choose(setup.steps, 4), setup.choose(32, 2)
+    preset = setup.find_lvae_preset("kitti360")
+    layouts, steps, batch = Layouts(setup, setup.make_spec(preset)), setup.choose(setup.steps, 4), setup.choose(32, 2)
     first_batch = layouts.draw(0, min(64, len(layouts)))
     trainer = make_lvae_for_training(setup, "auto", steps, first_batch, compiled=not setup.tiny)
     folder = setup.output / "learn"
@@ -614,15 +633,17 @@ def run_learn(setup: Setup) -> Iterator[Row]:
             yield Row(f"learn, {name} after {trainer.steps_done} steps", curve[-1][1][name], "")
     trainer.model.eval()
     held_out = slice(len(layouts), None)
-    for kind, scenes in (("held out", held_out), ("scenes of the training", slice(0, layouts.num_held_out))):
-        for name, value in measure_primitives(trainer.model, layouts.select(scenes)).items():
+    for kind, scenes in (("held out", held_out), ("training scenes", slice(0, layouts.num_held_out))):
+        with trainer.run_uncompiled():
+            found = measure_primitives(cast(LayoutVAE, trainer.model), layouts.select(scenes))
+        for name, value in found.items():
             yield Row(f"learn, {kind}, {name} after {trainer.steps_done} steps", value, "")
     if done:
         yield Row(
             "learn, scenes per second",
             done * batch / seconds,
             "scenes/s",
-            note=f"steps {first} to {trainer.steps_done}",
+            note=f"steps {first} to {trainer.steps_done}, with compilation and checkpoints",
         )
 
 

@@ -58,7 +58,7 @@ class Config:
     cuda_graphs: bool = False
     """Replay each denoising step as one CUDA graph; faster for small batches, and ignored without a GPU."""
     compile: bool = False
-    """Compile the transformer's block with torch.compile, which takes half a minute; useful on GPUs."""
+    """Compile the transformer's block with torch.compile, which takes some seconds; useful on GPUs."""
     decode_batch_size: int = 1
     """Number of latents decoded together; more than 1 is faster on GPUs and changes scenes by rounding."""
     num_glb: int = 0

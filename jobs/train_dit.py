@@ -71,7 +71,7 @@ class Config:
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """Floating-point precision; auto is bf16 on GPUs that support it, else fp32."""
     compile: bool = False
-    """Compile the transformer's block with torch.compile, which takes half a minute; useful on GPUs."""
+    """Compile the transformer's block with torch.compile, which takes some seconds; useful on GPUs."""
     checkpoint_every: int | None = None
     """Number of steps between checkpoints (default: a twentieth of the run, at least four steps)."""
     seed: int = 0

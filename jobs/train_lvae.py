@@ -74,7 +74,7 @@ class Config:
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """Floating-point precision; auto is bf16 on GPUs that support it, else fp32."""
     compile: bool = False
-    """Compile the convolutional networks and transformer layers, which takes minutes; useful on GPUs."""
+    """Compile the convolutional networks and transformer layers with torch.compile; not yet measured on a GPU."""
     checkpoint_every: int | None = None
     """Number of steps between checkpoints (default: a twentieth of the run, at least four steps)."""
     flip: bool = False

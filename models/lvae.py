@@ -187,7 +187,7 @@ class LayoutVAE(ConfiguredModel):
             return {}
         return {"ground_encoder.shortcut": 0.05, "ground_decoder.shortcut": 0.05, "ground_": 0.25}
 
-    def list_compiled_parts(self) -> list[nn.Module]:
+    def list_parts_to_compile(self) -> list[nn.Module]:
         """Return the modules that take most of the time: the convolutional networks and the transformer layers."""
         parts: list[nn.Module] = [part.net for part in (self.ground_encoder, self.ground_decoder) if part]
         for branch in (self.object_encoder, self.object_decoder):

@@ -11,7 +11,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -93,7 +93,7 @@ class ExecutionConfig:
         accumulate: Number of parts into which a batch is split. The parts are computed one after another to save
             memory.
         precision: "fp32", "bf16" or "auto". "auto" selects bf16 if the hardware supports it, otherwise fp32.
-        compile: Whether torch compiles the parts of the network that take the most time.
+        compile: Whether torch compiles the parts of the network that take the most time, in place.
 
     Raises:
         ValueError: A value is out of range or unknown.
@@ -217,10 +217,22 @@ def sample_uniform(generators: list[torch.Generator], count: int, device: torch.
     Returns:
         (b, count) random numbers.
     """
-    drawn = torch.stack([torch.rand(count, generator=generator) for generator in generators])
-    if device.type == "cuda":  # A copy from other memory would wait for the GPU.
-        drawn = drawn.pin_memory()
-    return drawn.to(device, non_blocking=True)
+    return copy_without_waiting(torch.stack([torch.rand(count, generator=g) for g in generators]), device)
+
+
+def copy_without_waiting(values: Tensor, device: torch.device) -> Tensor:
+    """Copy a tensor to a device. A copy from memory that is not pinned would wait for earlier work of a GPU.
+
+    Args:
+        values: Tensor on any device.
+        device: Device of the result.
+
+    Returns:
+        Tensor on the device.
+    """
+    if device.type == "cuda" and values.device.type == "cpu":
+        values = values.pin_memory()
+    return values.to(device, non_blocking=True)
 
 
 def sample_corruption(
@@ -313,7 +325,7 @@ def make_diffusion_loss(
     posteriors. Labels are dropped once per sample.
 
     Args:
-        dit: Model, which defines the noise schedule.
+        dit: Model on its device, which defines the noise schedule.
         label_dropout: Probability that a training sample gets the null label.
         timestep_sampling: Density of the timesteps (`sample_timesteps`).
 
@@ -330,7 +342,7 @@ def make_diffusion_loss(
     ) -> dict[str, Tensor]:
         mean, logvar, label = arrays["mean"].float(), arrays["logvar"].float(), arrays["label"]
         device = mean.device
-        # Nothing here waits for a GPU. The random numbers are therefore drawn while it computes the previous step.
+        # No line below waits for a GPU. Random numbers are thus drawn during the backward pass of the previous step.
         posterior_noise, noise = sample_noise(generators, shape, device, count=2)
         uniform = sample_uniform(generators, 2, device)
         latent = (mean + (0.5 * logvar).exp() * posterior_noise - shift) / scale
@@ -406,7 +418,7 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"], group["betas"] = group["share"] * rate, (beta1, self.settings.betas[1])
         positions = list(positions)
-        arrays = {k: v.to(self.device, non_blocking=True) for k, v in arrays.items()}
+        arrays = {name: copy_without_waiting(value, self.device) for name, value in arrays.items()}
         self.optimiser.zero_grad(set_to_none=True)
         totals: dict[str, Tensor] = {}
         size = -(-len(positions) // self.execution.accumulate)
@@ -450,13 +462,18 @@ class Trainer:
 
         The model is called without its wrapper, because DistributedDataParallel would wait for the other workers.
         """
-        bad = [
-            position
-            for k, position in enumerate(positions)
-            if self._compute_losses(self.model, {name: value[k : k + 1] for name, value in arrays.items()}, [position])
-            is None
-        ]
+        with self.run_uncompiled():
+            bad = [
+                position
+                for k, position in enumerate(positions)
+                if self._compute_losses(self.model, {name: v[k : k + 1] for name, v in arrays.items()}, [position])
+                is None
+            ]
         return bad if len(bad) < len(positions) else []
+
+    def run_uncompiled(self) -> AbstractContextManager:
+        """Return a context in which the network runs without compiled code, for batches of other sizes."""
+        return torch.compiler.set_stance("force_eager") if self.execution.compile else nullcontext()
 
     @torch.no_grad()
     def update_ema(self) -> None:
@@ -570,7 +587,8 @@ def make_lvae_trainer(
     groups = model.config.objects["denoising_groups"]
     loss = make_layout_loss(model.spec, model.latent_shape, kl_weight, latent_noise, groups)
     if execution.compile:
-        _compile_parts(model.list_compiled_parts())
+        for part in model.list_parts_to_compile():
+            part.compile()
     return Trainer(model, loss, settings, device, wrap(model), execution)
 
 
@@ -601,14 +619,9 @@ def make_dit_trainer(
     model = model.to(device)
     loss = make_diffusion_loss(model, label_dropout, timestep_sampling)
     if execution.compile:
-        _compile_parts(model.blocks)
+        for block in model.blocks:  # All blocks share the compiled code.
+            block.compile(dynamic=False)
     return Trainer(model, loss, settings, device, wrap(model), execution)
-
-
-def _compile_parts(parts: Iterable[nn.Module]) -> None:
-    """Compile modules in place. Modules of the same class and shapes share the compiled code."""
-    for part in parts:
-        part.compile(fullgraph=True)
 
 
 def count_flops(call: Callable[[], object]) -> float:

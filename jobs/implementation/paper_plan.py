@@ -29,7 +29,7 @@ SWEEPS_PER_LOG = 156.5  # Argoverse 2: 313 sweeps in two logs.
 # Measured by benchmarks/cost_rates.py: CPU time (s) and stored bytes per scene.
 PREPROCESS_S, SCENE_BYTES, LATENT_BYTES, GENERATED_BYTES, FEATURE_BYTES = 0.0054, 14e3, 146e3, 21e3, 80e3
 EVALUATE_S = 0.64
-# Reported by the paper (supplement B.2 and B.3, Tab. 3): GPU hours on A100, and seconds per scene on one A100.
+# Reported by the paper (supplement B.2 and B.3, Tab. 3): GPU hours on A100, and seconds per scene (GPU not stated).
 PAPER_LVAE_GPU_H, PAPER_DIT_GPU_H, PAPER_SAMPLE_S = 72.0, 288.0, {"b": 0.58, "l": 1.78, "xl": 2.11}
 ENCODE_GPU_S = 0.01  # Assumed.
 # Measured on two cores by a rehearsal of KITTI-360 at 4e9d2b7: seconds per step and per scene. The layout VAE needed
@@ -274,7 +274,7 @@ def _list_transformer_stages(
         ),
         scenes * per_scene * config.num_inference_steps / 250 / workers / 3600,
         scenes * GENERATED_BYTES / 1e9,
-        REHEARSED_ON_ONE_CORE if mini else f"the paper's {per_scene:g} s per scene on one A100",
+        REHEARSED_ON_ONE_CORE if mini else f"the paper's {per_scene:g} s per scene",
     )
     common: dict[str, Any] = {"real": data, "generated": home_path("generated"), "run": size}
     common |= {"inception": config.inception, "num_actors": workers, **shared}

@@ -104,4 +104,4 @@ class RePaintOptions(GenerationOptions):
     cuda_graphs: bool = False
     """Replay each denoising step as one CUDA graph; not used in steps with pseudoinverse guidance or without a GPU."""
     compile: bool = False
-    """Compile the transformer's block with torch.compile, which takes half a minute; useful on GPUs."""
+    """Compile the transformer's block with torch.compile, which takes some seconds; useful on GPUs."""

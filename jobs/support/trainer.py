@@ -223,7 +223,8 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
         ray.train.report(metrics)
         return
     if run.validate:
-        values, pictures = run.validate(trainer)
+        with trainer.run_uncompiled():
+            values, pictures = run.validate(trainer)
         if values:
             run.tracker.metrics(values, trainer.steps_done)
         for name, image in pictures.items():

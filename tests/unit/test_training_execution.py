@@ -21,7 +21,7 @@ from models.training import (
 
 setup = gpu.Setup(torch.device("cpu"), True, 989.0, Path("unused"), "", 1)
 preset, dit_preset = LVAE_PRESETS["smoke"], DIT_PRESETS["smoke"]
-layouts = gpu.Layouts(setup, setup.spec(preset))
+layouts = gpu.Layouts(setup, setup.make_spec(preset))
 
 def train(kind, compiled):
     execution = ExecutionConfig(precision="fp32", compile=compiled)
@@ -32,11 +32,15 @@ def train(kind, compiled):
         trainer = make_dit_trainer(model, settings, 0.1, setup.device, execution=execution)
         batches = [gpu.draw_posteriors(trainer, 4, seed) for seed in range(3)]
     else:
-        model = LayoutVAE(layout=setup.spec(preset).to_dict(), **preset.architecture())
+        model = LayoutVAE(layout=setup.make_spec(preset).to_dict(), **preset.architecture())
         trainer = make_lvae_trainer(model, make_lvae_settings(preset), 1e-6, setup.device, execution=execution)
         batches = [layouts.draw(step, 2) for step in range(3)]
     names = list(trainer.model.state_dict())
     losses = [float(trainer.step(batch, range(len(next(iter(batch.values())))))["loss"]) for batch in batches]
+    few = {name: value[:1] for name, value in batches[0].items()}
+    with trainer.run_uncompiled(), torch.no_grad():
+        trainer.model.eval()
+        trainer.loss(trainer.model, few, [torch.Generator()])
     return torch.tensor(losses), names
 
 for kind in ("dit", "lvae"):
@@ -51,7 +55,7 @@ def test_compiled_training_has_equal_losses():
     """Runs in a process without checks of annotations, which cannot be compiled.
 
     The blocks of the transformer share one graph. The layout VAE has one graph for each of its four kinds of parts, and
-    may have one more for other numbers of primitives.
+    may have one more for other numbers of primitives. A smaller batch of the validation is not compiled.
     """
     done = run_command("-c", COMPILE, PYTHONPATH=f"{ROOT}:{ROOT / 'tests'}")
     dit, lvae = (line.split() for line in done.stdout.splitlines())
