@@ -250,7 +250,7 @@ def sample_corruption(
         (b, *shape) noise.
     """
     drawn = [torch.randn(shape, generator=g) * torch.randn((), generator=g).abs() * spread for g in generators]
-    return torch.stack(drawn).to(device)
+    return copy_without_waiting(torch.stack(drawn), device)
 
 
 def make_layout_loss(

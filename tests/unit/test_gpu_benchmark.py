@@ -126,6 +126,19 @@ def test_failed_section_does_not_stop_the_others(tmp_path, monkeypatch, capsys):
     assert "| first | 3 s |" in table and "| last | 4 s |" in table  # The rows of the complete run are kept.
 
 
+def test_rows_of_a_stopped_section_are_kept(tmp_path, monkeypatch):
+    def stop(setup):
+        yield gpu.Row("first", 1.0, "s")
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(gpu.SECTIONS, "latency", stop)
+    monkeypatch.setitem(gpu.SECTIONS, "throughput", lambda setup: iter([gpu.Row("second", 2.0, "s")]))
+    setup = gpu.Setup(torch.device("cpu"), False, 989.0, tmp_path, "", 1)
+    assert gpu.run_sections(setup, ["latency", "throughput"]) == 1
+    table = (tmp_path / "gpu.md").read_text()
+    assert "| first | 1 s |" in table and "second" not in table  # The sections after it do not run.
+
+
 def test_primitives_of_a_perfect_decoder_are_all_found():
     """A decoder that returns the truth has no error; one that is 2 m off finds nothing within 1 m."""
     spec = LayoutSpec()
