@@ -294,6 +294,9 @@ def make_layout_loss(
 TimestepSampling = Literal["uniform", "logit_normal"]
 # Mean and standard deviation of logit(t / 1000). Half of the timesteps lie between 196 and 552.
 LOGIT_NORMAL = (-0.6, 1.2)
+# Compiled layers of the object encoder are compiled for each number of slots, of which the paper's 514 slots give five.
+# With symbolic sizes, they exceeded dynamo's limit of eight versions on an H200.
+COMPILED_SLOT_MULTIPLE = 128
 
 
 def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, num_timesteps: int) -> Int[Tensor, " b"]:
@@ -587,8 +590,10 @@ def make_lvae_trainer(
     groups = model.config.objects["denoising_groups"]
     loss = make_layout_loss(model.spec, model.latent_shape, kl_weight, latent_noise, groups)
     if execution.compile:
+        if model.object_encoder:
+            model.object_encoder.slot_multiple = COMPILED_SLOT_MULTIPLE
         for part in model.list_parts_to_compile():
-            part.compile()
+            part.compile(dynamic=False)
     return Trainer(model, loss, settings, device, wrap(model), execution)
 
 

@@ -63,6 +63,7 @@ class ObjectEncoder(nn.Module):
         super().__init__()
         width, heads, hidden = config.width, config.heads, config.hidden
         self.slots = tuple(slots)
+        self.slot_multiple = 1  # Compiled layers need few different numbers of slots.
         register_computed_buffers(self)
         self.category = nn.Embedding(len(slots), CATEGORY_EMBEDDING)
         self.project_in = nn.Linear(FEATURES + CATEGORY_EMBEDDING + 1, width)
@@ -151,9 +152,10 @@ class ObjectEncoder(nn.Module):
 
         Returns:
             Features, `real` and categories of n slots per sample, where n is the largest number of primitives in a
-            scene of the batch.
+            scene of the batch, rounded up to a multiple of `slot_multiple`.
         """
         most = max(int(real.sum(dim=1).max()), 1)
+        most = -(-most // self.slot_multiple) * self.slot_multiple
         order = real.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :most]  # (b, most)
         picked = features.gather(1, order[..., None].expand(-1, -1, features.shape[-1]))
         return picked, real.gather(1, order), self.slot_category[order]

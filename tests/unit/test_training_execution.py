@@ -36,6 +36,8 @@ def train(kind, compiled):
         model = LayoutVAE(layout=setup.make_spec(preset).to_dict(), **preset.architecture())
         trainer = make_lvae_trainer(model, make_lvae_settings(preset), 1e-6, setup.device, execution=execution)
         batches = [layouts.draw(step, 2) for step in range(3)]
+        for step, batch in enumerate(batches):
+            batch["real"][:, 100 - 30 * step :] = False
     names = list(trainer.model.state_dict())
     losses = [float(trainer.step(batch, range(len(next(iter(batch.values())))))["loss"]) for batch in batches]
     few = {name: value[:1] for name, value in batches[0].items()}
@@ -51,7 +53,7 @@ print(close and len(set(plain.tolist())) == 3 and names == same_names, counters[
 """
 
 
-@pytest.mark.parametrize(("kind", "graphs"), [("dit", (1,)), pytest.param("lvae", (4, 5), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("kind", "graphs"), [("dit", (1,)), pytest.param("lvae", (4,), marks=pytest.mark.slow)])
 def test_compiled_training_has_equal_losses(kind, graphs):
     """Runs in a process without checks of annotations, which cannot be compiled.
 
