@@ -149,7 +149,7 @@ def compare_variants(config: Branches) -> str:
     guard_study(output, {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED})
     record = storage.join_uri(output, "mlflow.json")
     with (
-        hold_output(output, "ablation", config),
+        hold_output(output, "ablation", config, training=True),
         Tracker.start("pritti-ablation", config.name, asdict(config), record).end_on_error() as tracker,
     ):
         scores = []

@@ -30,3 +30,11 @@ def test_names_are_at_most_60_characters(folder):
 def test_jobs_are_executable():
     paths = sorted((ROOT / "jobs").glob("[!_]*.py"))
     assert len(paths) > 20 and [path.name for path in paths if not path.stat().st_mode & 0o111] == []
+
+
+def test_jobs_that_train_start_ray_with_a_dashboard():
+    """Without one, Ray Train may ask the dashboard of another Ray on the machine, and restart the training."""
+    texts = {path.name: path.read_text() for path in (ROOT / "jobs/implementation").glob("*.py")}
+    training = {name: text for name, text in texts.items() if "fit(training" in text}
+    assert len(training) >= 3
+    assert [name for name, t in training.items() if "training=True" not in t and "hold_training(" not in t] == []
