@@ -70,6 +70,7 @@ browser:
 	fi
 
 .venv/ready: pyproject.toml infra/constraints.txt
+	@echo "installing packages to .venv, 2 to 5 minutes"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	PIP_CONSTRAINT=infra/constraints.txt $(BIN)/pip install --disable-pip-version-check -q -e '.[dev]'
 	@# The OpenDRIVE schemas for a test. Its dependencies would install an older numpy.

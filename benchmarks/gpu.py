@@ -45,8 +45,11 @@ from functools import partial
 from pathlib import Path
 from typing import cast
 
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # Torch reads this value when it is loaded (models/__init__.py).
+
 import numpy as np
 import torch
+from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from models.batch import LayoutBatch
@@ -297,8 +300,11 @@ def run_throughput(setup: Setup) -> Iterator[Row]:
 
 def load_scenes(path: str) -> dict[str, np.ndarray]:
     """Read compact layouts (`tensors.encode_layout`) from a file of `write_scenes`; see there."""
-    stored = load_file(path)
-    shapes = json.loads(stored["shapes"].tobytes())
+    try:
+        stored = load_file(path)
+        shapes = json.loads(stored["shapes"].tobytes())
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        raise ValueError(f"--scenes {path}: {error}; make this file with --write-scenes FILE") from error
     found = {}
     for name in FIELDS:
         kind, shape = shapes[name]
@@ -602,8 +608,6 @@ def run_learn(setup: Setup) -> Iterator[Row]:
 
     The training ends a minute before LEARN_SECONDS, so there is time to save and to score.
     """
-    if not setup.scenes and not setup.tiny:
-        raise ValueError("learn needs --scenes FILE; make it with --write-scenes FILE")
     preset = setup.find_lvae_preset("kitti360")
     layouts, steps, batch = Layouts(setup, setup.make_spec(preset)), setup.choose(setup.steps, 4), setup.choose(32, 2)
     first_batch = layouts.draw(0, min(64, len(layouts)))
@@ -733,6 +737,9 @@ def main() -> int:
     parser.add_argument("--num-scenes", type=int, default=256, help="number of scenes to write (default: 256)")
     options = parser.parse_args()
     if options.write_scenes:
+        if not options.write_scenes.absolute().parent.is_dir():
+            print(f"error: --write-scenes {options.write_scenes}: its directory does not exist", file=sys.stderr)
+            return 2
         write_scenes(options.write_scenes, options.num_scenes)
         return 0
     if not options.cpu and not torch.cuda.is_available():
@@ -744,9 +751,15 @@ def main() -> int:
     except ValueError as error:
         print(f"error: {str(error).partition(';')[0]}; use another GPU", file=sys.stderr)
         return 2
+    if options.scenes:
+        load_scenes(options.scenes)
+    elif "learn" in options.only and not options.cpu:
+        raise ValueError(
+            "learn needs --scenes FILE; make it with --write-scenes FILE, or name the other sections with --only"
+        )
     setup = Setup(device, options.cpu, options.peak_tflops, options.output, options.scenes, options.steps)
     failed = run_sections(setup, options.only)
-    print(f"{options.output}/gpu.md")
+    print(f"results: {options.output}/gpu.md")
     return 1 if failed else 0
 
 

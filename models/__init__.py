@@ -3,7 +3,12 @@
 This package does not import Ray. It imports diffusers only when a function needs diffusers.
 """
 
+import os
 from importlib import import_module
+
+# Torch reads this value when it is loaded. If another process is busy, threads that spin while they wait make small
+# networks many times slower.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _HOME = {"LayoutVAE": "models.lvae", "DiT": "models.dit", "PrITTIPipeline": "models.pipeline"}
 

@@ -162,7 +162,7 @@ def make_scene_sections(config: Config, real: list[Scene], generated: list[Scene
         ),
         draw_scene_pictures(
             "Generated scenes",
-            "The diffusion transformer of this demo sampled each scene for the vegetation label above its picture.",
+            "The diffusion transformer of this demo sampled each scene for the vegetation label under its picture.",
             select_one_per_label(generated, SHOWN),
             "generated",
         ),

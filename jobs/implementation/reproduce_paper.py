@@ -54,6 +54,7 @@ RUN: Mapping[str, Callable[[Any], Any]] = {
     "sample_scenes": sample,
     "evaluate_scenes": evaluate,
 }
+GPU_JOBS = ("train_lvae", "encode_latents", "ablate_lvae", "train_dit", "sample_scenes")
 GIGABYTE = 1e9
 
 
@@ -71,7 +72,9 @@ def main(config: PaperConfig) -> None:
     plan = make_plan(config, counts)
     about = "about " if isinstance(config, Av2) else ""
     print(f"{make_absolute(config.input)}: {about}{counts.train:,} training poses, {about}{counts.test:,} test poses")
-    print_plan(plan, home)
+    print_plan(plan, home, config.scale == "mini")
+    if not config.inception:
+        print("note: without --inception FILE, the tables have no FID, IS, precision and recall")
     if config.dry_run:
         return
     require_space(plan, home)
@@ -138,13 +141,17 @@ def guard_scale(config: PaperConfig, home: str) -> None:
         raise ValueError(f"{home} holds a run with {difference}; choose another --output")
 
 
-def print_plan(plan: list[Stage], home: str) -> None:
-    """Print the stages with their estimates and equivalent commands."""
-    table = Columns("stage", "hours", "GB", "basis of the time")
+def print_plan(plan: list[Stage], home: str, mini: bool) -> None:
+    """Print the stages with their estimates and equivalent commands. The times of the mini scale are those of CPUs."""
+    table = Columns("stage", "GPU hours", "CPU hours", "GB", "basis of the time")
+    hours = {True: 0.0, False: 0.0}
     for stage in plan:
-        table.add_row(stage.name, f"{stage.hours:,.2f}", f"{stage.gigabytes:,.2f}", stage.basis)
-    total = (sum(s.hours for s in plan), sum(s.gigabytes for s in plan))
-    table.add_row("total", f"{total[0]:,.1f}", f"{total[1]:,.1f}", "")
+        on_gpu = not mini and stage.job in GPU_JOBS
+        hours[on_gpu] += stage.hours
+        shown = f"{stage.hours:,.2f}"
+        gigabytes = f"{stage.gigabytes:,.2f}"
+        table.add_row(stage.name, shown if on_gpu else "", "" if on_gpu else shown, gigabytes, stage.basis)
+    table.add_row("total", f"{hours[True]:,.1f}", f"{hours[False]:,.1f}", f"{sum(s.gigabytes for s in plan):,.1f}", "")
     Console(width=max(100, Console().width)).print(table)
     print("All numbers are estimates. These commands do the same:")
     print(f"  export PRITTI_HOME={shlex.quote(home)}")

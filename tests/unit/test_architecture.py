@@ -1,6 +1,7 @@
 """Tests of the imports: the order of imports is pritti, jobs, pipelines, models, without cycles."""
 
 import ast
+import os
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
@@ -136,6 +137,14 @@ def test_ingest_imports_no_torch():
     """An import of torch would delay each preprocessing process by one to two seconds."""
     code = "import sys, pipelines.preprocess.ingest; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
+
+
+@pytest.mark.parametrize("package", ["models", "pipelines"])
+def test_packages_stop_spinning_threads_before_torch_loads(package):
+    code = f"import os, sys, {package}; print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, env=environment)
+    assert done.stdout.split() == ["PASSIVE", "False"], done.stderr
 
 
 def test_models_import_without_ray_or_pyarrow():

@@ -69,6 +69,23 @@ def test_without_gpu_the_error_says_what_to_do(tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+def test_files_that_cannot_be_used_are_errors_before_any_section(tmp_path, monkeypatch, capsys):
+    broken = tmp_path / "broken.safetensors"
+    broken.write_text("no scenes")
+    for path in (tmp_path / "missing.safetensors", broken):
+        monkeypatch.setattr(sys, "argv", ["gpu.py", "--cpu", "--output", str(tmp_path / "out"), "--scenes", str(path)])
+        with pytest.raises(ValueError, match=f"--scenes {path}: .*; make this file with --write-scenes FILE"):
+            gpu.main()
+    monkeypatch.setattr(sys, "argv", ["gpu.py", "--write-scenes", str(tmp_path / "none" / "x.safetensors")])
+    assert gpu.main() == 2 and "none/x.safetensors: its directory does not exist" in capsys.readouterr().err
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gpu, "require_bf16", lambda device: None)
+    monkeypatch.setattr(sys, "argv", ["gpu.py", "--output", str(tmp_path / "out")])
+    with pytest.raises(ValueError, match="learn needs --scenes FILE"):
+        gpu.main()
+    assert not (tmp_path / "out").exists()
+
+
 def test_scenes_travel_without_loss_and_are_small(tmp_path):
     path = tmp_path / "town.safetensors"
     gpu.write_scenes(path, 6)
