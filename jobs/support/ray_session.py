@@ -20,7 +20,7 @@ def start_ray(training: bool = False, object_store_bytes: int | None = None) -> 
     Args:
         training: Also start the dashboard. Ray Train asks the dashboard once per second which workers are alive, and
             logs a warning if there is no dashboard. If another Ray on this machine has a dashboard, Ray Train asks that
-            one, finds no workers and restarts the training. Other jobs do not need the dashboard.
+            one, does not find its controller and restarts the training. Other jobs do not need the dashboard.
         object_store_bytes: Size of the object store of a Ray that is started on this machine (default: Ray's choice).
     """
     set_ray_environment()
