@@ -144,14 +144,16 @@ def guard_scale(config: PaperConfig, home: str) -> None:
 def print_plan(plan: list[Stage], home: str, mini: bool) -> None:
     """Print the stages with their estimates and equivalent commands. The times of the mini scale are those of CPUs."""
     table = Columns("stage", "GPU hours", "CPU hours", "GB", "basis of the time")
-    hours = {True: 0.0, False: 0.0}
+    gpu_hours = 0.0
     for stage in plan:
-        on_gpu = not mini and stage.job in GPU_JOBS
-        hours[on_gpu] += stage.hours
-        shown = f"{stage.hours:,.2f}"
-        gigabytes = f"{stage.gigabytes:,.2f}"
-        table.add_row(stage.name, shown if on_gpu else "", "" if on_gpu else shown, gigabytes, stage.basis)
-    table.add_row("total", f"{hours[True]:,.1f}", f"{hours[False]:,.1f}", f"{sum(s.gigabytes for s in plan):,.1f}", "")
+        hours = [f"{stage.hours:,.2f}", ""]
+        if mini or stage.job not in GPU_JOBS:
+            hours.reverse()
+        else:
+            gpu_hours += stage.hours
+        table.add_row(stage.name, *hours, f"{stage.gigabytes:,.2f}", stage.basis)
+    cpu_hours, gigabytes = sum(s.hours for s in plan) - gpu_hours, sum(s.gigabytes for s in plan)
+    table.add_row("total", f"{gpu_hours:,.1f}", f"{cpu_hours:,.1f}", f"{gigabytes:,.1f}", "")
     Console(width=max(100, Console().width)).print(table)
     print("All numbers are estimates. These commands do the same:")
     print(f"  export PRITTI_HOME={shlex.quote(home)}")
