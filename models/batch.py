@@ -5,11 +5,13 @@ This module is separate from layout.py because data jobs do not need torch.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from models.geometry.signed_distance import compute_signed_distance_px
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +29,7 @@ class LayoutBatch:
     occupied: Float[Tensor, "batch ground rows cols"]
     features: Float[Tensor, "batch slots 9"]
     real: Bool[Tensor, "batch slots"]
+    _distances_px: dict[int, Tensor] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.real)
@@ -40,7 +43,21 @@ class LayoutBatch:
         Returns:
             The batch on that device.
         """
-        return LayoutBatch(*(getattr(self, name).to(device, non_blocking=True) for name in self.__dataclass_fields__))
+        parts = (self.height, self.occupied, self.features, self.real)
+        return LayoutBatch(*(part.to(device, non_blocking=True) for part in parts))
+
+    def measure_distances_px(self, reach_px: int) -> Float[Tensor, "batch ground rows cols"]:
+        """Return the signed distances of pixel centres from the edges of the masks. The batch keeps the result.
+
+        Args:
+            reach_px: Largest distance (pixels); larger distances are clipped to this value.
+
+        Returns:
+            Signed distances in pixels, positive inside the masks.
+        """
+        if reach_px not in self._distances_px:
+            self._distances_px[reach_px] = compute_signed_distance_px(self.occupied > 0.5, reach_px)
+        return self._distances_px[reach_px]
 
     @classmethod
     def from_compact(cls, arrays: dict[str, Tensor]) -> LayoutBatch:

@@ -18,7 +18,8 @@ from models.layout import FEATURES, LayoutSpec
 from models.vae.cell_decoder import CellDecoder
 from models.vae.config import Branches, GroundConfig, LayoutVAEConfig, ObjectConfig, nest_flat_options, parse_options
 from models.vae.detr_decoder import DETRDecoder
-from models.vae.ground import GroundDecoder, GroundEncoder, init_from_data
+from models.vae.ground import GroundDecoder, GroundEncoder, compute_edge_reach_px, init_from_data
+from models.vae.level_sets import LevelSetDecoder, init_level_sets
 from models.vae.matching import MatchWeights
 from models.vae.objects import ObjectEncoder
 from models.vae.outputs import LayoutOutput, Posterior, Proposals
@@ -102,7 +103,8 @@ class LayoutVAE(ConfiguredModel):
         self.ground_encoder = self.ground_decoder = self.object_encoder = self.object_decoder = None
         if branches != "objects":
             self.ground_encoder = GroundEncoder(num_classes, latent_channels, ground, shortcut)
-            self.ground_decoder = GroundDecoder(num_classes, seen, ground, shortcut)
+            kind = LevelSetDecoder if ground.level_sets else GroundDecoder
+            self.ground_decoder = kind(num_classes, seen, ground, shortcut)
         if branches != "ground":
             self.object_encoder = ObjectEncoder(spec.slots, latent_channels, size, objects, shortcut)
             if objects.decoder == "detr":
@@ -152,7 +154,8 @@ class LayoutVAE(ConfiguredModel):
         """
         channels = self.config.latent_channels
         if self.ground_encoder and self.ground_decoder:
-            init_from_data(self.ground_encoder, self.ground_decoder, batch.height, batch.occupied)
+            init = init_level_sets if isinstance(self.ground_decoder, LevelSetDecoder) else init_from_data
+            init(self.ground_encoder, self.ground_decoder, batch.height, batch.occupied)
             bias = cast(Tensor, self.ground_encoder.net.conv_out.bias)
             bias[channels:] = SOLVED_LOGVAR if self.config.shortcut else INITIAL_LOGVAR
         if not (self.object_encoder and self.object_decoder):
@@ -195,6 +198,11 @@ class LayoutVAE(ConfiguredModel):
         return parts
 
     @property
+    def reach_px(self) -> int:
+        """Largest distance from an edge that the smooth maps of the ground branch represent, in pixels."""
+        return compute_edge_reach_px(self.spec.grid.rows // self.latent_shape[-1])
+
+    @property
     def proposes_duplicates(self) -> bool:
         """True if two proposals may decode the same object: two cells of the cell decoder."""
         return self.config.objects["decoder"] == "cells"
@@ -215,14 +223,20 @@ class LayoutVAE(ConfiguredModel):
         """
         moments = []
         if self.ground_encoder:
-            moments.append(self.ground_encoder(torch.cat([batch.height, batch.occupied], dim=1)).chunk(2, 1))
+            distance = batch.measure_distances_px(self.reach_px) if self.config.shortcut else None
+            maps = torch.cat([batch.height, batch.occupied], dim=1)
+            moments.append(self.ground_encoder(maps, distance).chunk(2, 1))
         if self.object_encoder:
             moments.append(self.object_encoder(batch.features, batch.real).chunk(2, 1))
         mean, logvar = (torch.cat(part, dim=1) for part in zip(*moments, strict=True))
         return Posterior(mean, logvar.clamp(-30, 20))
 
     def decode(
-        self, latent: Float[Tensor, "batch c2 h w"], noised: Tensor | None = None, real: Tensor | None = None
+        self,
+        latent: Float[Tensor, "batch c2 h w"],
+        noised: Tensor | None = None,
+        real: Tensor | None = None,
+        raster_px: int | None = None,
     ) -> LayoutOutput:
         """Decode latents to layouts.
 
@@ -233,13 +247,18 @@ class LayoutVAE(ConfiguredModel):
             latent: Joint latents.
             noised: (batch, groups, N, 9) features of true primitives with noise, for denoising queries in training.
             real: (batch, N); True for each slot that holds a primitive.
+            raster_px: Number of rows and of columns of the rasters; None: that of the LayoutSpec. Only level sets have
+                another resolution.
 
         Returns:
             Output of both decoders.
+
+        Raises:
+            ValueError: The model has no level sets, and `raster_px` differs from the rows of the LayoutSpec.
         """
         split = self.config.split_latent and self.config.branches == "both"
         ground, objects = latent.chunk(2, dim=1) if split else (latent, latent)
-        height, occupancy_logit = self.decode_ground(ground)
+        height, occupancy_logit, distance = self.decode_ground(ground, raster_px)
         found, decoder = self.decode_objects(objects, noised, real), self.object_decoder
         return LayoutOutput(
             height,
@@ -252,22 +271,39 @@ class LayoutVAE(ConfiguredModel):
             self.config.branches,
             found.auxiliary,
             found.denoised,
+            distance,
+            self.reach_px,
         )
 
-    def decode_ground(self, latent: Float[Tensor, "batch c h w"]) -> tuple[Tensor, Tensor]:
+    def decode_ground(
+        self, latent: Float[Tensor, "batch c h w"], raster_px: int | None = None
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Decode the ground.
 
         Args:
             latent: Channels that the ground decoder reads.
+            raster_px: See `decode`.
 
         Returns:
-            Normalised heights and occupancy logits. If the model has no ground branch, all pixels are unoccupied.
+            Normalised heights, occupancy logits, and signed distances in units of `reach_px` pixels (None without level
+            sets). If the model has no ground branch, all pixels are unoccupied.
+
+        Raises:
+            ValueError: The model has no level sets, and `raster_px` differs from the rows of the LayoutSpec.
         """
-        if self.ground_decoder:
-            return self.ground_decoder(latent).chunk(2, dim=1)
+        if isinstance(self.ground_decoder, LevelSetDecoder):
+            return self.ground_decoder(latent, raster_px)
         grid = self.spec.grid
+        if raster_px not in (None, grid.rows):
+            raise ValueError(
+                f"raster_px is {raster_px}, but this model decodes rasters of {grid.rows} pixels; "
+                "only models with level sets (preset town) decode other resolutions"
+            )
+        if self.ground_decoder:
+            height, logit = self.ground_decoder(latent).chunk(2, dim=1)
+            return height, logit, None
         height = latent.new_zeros(len(latent), len(self.spec.ground_classes), grid.rows, grid.cols)
-        return height, torch.full_like(height, EMPTY_LOGIT)
+        return height, torch.full_like(height, EMPTY_LOGIT), None
 
     def decode_objects(
         self, latent: Float[Tensor, "batch c h w"], noised: Tensor | None = None, real: Tensor | None = None

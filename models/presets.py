@@ -69,7 +69,10 @@ SMOKE = LayoutVAEConfig(4, GroundConfig((8, 16, 16), 4), ObjectConfig(32, 1, 2, 
 SMALL_CELLS = ObjectConfig(128, 2, 4, 256, 256, decoder="cells", min_proposals_per_cell=3, loss_unit="cells")
 PAPER_CELLS = replace(PAPER.objects, decoder="cells", min_proposals_per_cell=3, loss_unit="cells")
 DEMO = LayoutVAEConfig(16, GroundConfig((32, 64), 8, 4, attention=False), SMALL_CELLS, shortcut=True)
-TOWN = LayoutVAEConfig(32, GroundConfig((32,), 8, 8, attention=False), SMALL_CELLS, shortcut=True)
+TOWN = LayoutVAEConfig(
+    16, GroundConfig((32, 64, 64), 8, 4, attention=False, level_sets=True), SMALL_CELLS, shortcut=True
+)
+LIGHT = LayoutVAEConfig(32, GroundConfig((32,), 8, 8, attention=False), PAPER_CELLS, shortcut=True)
 MINI = LayoutVAEConfig(32, GroundConfig((8, 16, 32, 64), 4), ObjectConfig(128, 3, 4, 256, 256))
 
 # fmt: off
@@ -77,16 +80,15 @@ LVAE_PRESETS: dict[str, LVAEPreset] = {
     #                        source      px   model  batch  steps
     "smoke":    LVAEPreset("town",      32,  SMOKE, 4,     8,       learning_rate=1e-3, final_learning_rate=1e-4),
     "demo":     LVAEPreset("town",      128, DEMO,  8,     5_000,   latent_noise=0.3, **QUICK),
-    "town":     LVAEPreset("town",      256, TOWN,  8,     2_000,   kl_weight=1e-7, **QUICK),
+    "town":     LVAEPreset("town",      256, TOWN,  8,     20_000,  latent_noise=0.3, **QUICK),
     # The paper reports three days of training on one A100 but not the number of steps.
     "kitti360": LVAEPreset("kitti360",  256, PAPER, 32,    300_000, init_from_data=False),
     "av2":      LVAEPreset("av2",       256, PAPER, 32,    300_000, init_from_data=False),
     # The networks of `kitti360` with fewer layers and less width, for two cores. It starts from the means of the data.
     "kitti360-mini": LVAEPreset("kitti360", 256, MINI, 4, 6_000, learning_rate=5e-4),
-    # This preset combines the paper's object encoder with the town's ground branch and the cell decoder.
+    # This preset combines the paper's object encoder with a smaller ground branch and the cell decoder.
     # The latent has the same shape as in the paper, but training costs less.
-    "kitti360-light": LVAEPreset("kitti360", 256, replace(TOWN, objects=PAPER_CELLS), 32, 300_000,
-                                 **(QUICK | LOWER_RATE)),
+    "kitti360-light": LVAEPreset("kitti360", 256, LIGHT, 32, 300_000, **(QUICK | LOWER_RATE)),
 }
 # fmt: on
 

@@ -27,6 +27,7 @@ GROUND_RULES: dict[str, Rule] = {
     "norm_groups": WIDTH,
     "pixel_unshuffle": Integer(1, 256),
     "attention": Flag(),
+    "level_sets": Flag(),
 }
 OBJECT_RULES: dict[str, Rule] = {
     "width": WIDTH,
@@ -57,12 +58,16 @@ class GroundConfig:
             paper.
         attention: If True, the middle blocks of encoder and decoder have self-attention over all cells, as in the
             paper.
+        level_sets: If True, the decoder returns signed distances and heights at nodes (one per pixel after the pixel
+            unshuffle) with cubic B-splines between the nodes (models/vae/level_sets.py). Otherwise, it returns one
+            logit and one height per pixel, as in the paper.
     """
 
     channels: tuple[int, ...] = (64, 128, 256, 512)
     norm_groups: int = 32
     pixel_unshuffle: int = 1
     attention: bool = True
+    level_sets: bool = False
 
     @property
     def cell_px(self) -> int:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import cast
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from models.base import apply_in_float32
+from models.geometry.signed_distance import compute_signed_distance_px
 from models.vae.config import GroundConfig
 from models.vae.convolutional import ConvolutionalDecoder, ConvolutionalEncoder
 
@@ -36,14 +37,22 @@ class GroundEncoder(nn.Module):
             config.norm_groups,
             config.attention,
         )
-        cell = config.cell_px
+        self.cell_px = config.cell_px
+        # The shortcut reads smooth maps at pixels or, for level sets, their means around nodes (level_sets.py).
+        self.node_px = config.pixel_unshuffle if config.level_sets else 1
+        cell = self.cell_px // self.node_px
         self.shortcut = nn.Conv2d(2 * num_classes, latent_channels, cell, stride=cell) if shortcut else None
 
-    def forward(self, maps: Float[Tensor, "batch maps rows cols"]) -> Float[Tensor, "batch moments h w"]:
+    def forward(
+        self,
+        maps: Float[Tensor, "batch maps rows cols"],
+        distance_px: Float[Tensor, "batch ground rows cols"] | None = None,
+    ) -> Float[Tensor, "batch moments h w"]:
         """Encode rasters.
 
         Args:
             maps: Normalised heights and masks, concatenated along the channel axis, in [0, 1].
+            distance_px: Signed distances of the masks up to `compute_edge_reach_px`, in pixels; None: compute them.
 
         Returns:
             Mean and log-variance, concatenated along the channel axis.
@@ -53,8 +62,27 @@ class GroundEncoder(nn.Module):
             return moments
         mean, logvar = moments.chunk(2, dim=1)
         height, occupied = maps.chunk(2, dim=1)
-        smooth = compute_smooth_maps(height, occupied, self.shortcut.stride[0])
+        smooth = self.compute_shortcut_input(height, occupied, distance_px)
         return torch.cat([mean + apply_in_float32(self.shortcut, smooth), logvar], dim=1)
+
+    def compute_shortcut_input(
+        self,
+        height: Float[Tensor, "batch ground rows cols"],
+        occupied: Float[Tensor, "batch ground rows cols"],
+        distance_px: Float[Tensor, "batch ground rows cols"] | None = None,
+    ) -> Float[Tensor, "batch maps nodes nodes"]:
+        """Compute the maps that the shortcut reads.
+
+        Args:
+            height: Normalised heights.
+            occupied: Masks, 0 or 1.
+            distance_px: See `forward`.
+
+        Returns:
+            Smooth maps at pixels or, for level sets, at nodes.
+        """
+        smooth = compute_smooth_maps(height, occupied, self.cell_px, distance_px)
+        return F.avg_pool2d(smooth, self.node_px) if self.node_px > 1 else smooth
 
 
 class GroundDecoder(nn.Module):
@@ -116,15 +144,11 @@ def init_from_data(
     if encoder.shortcut is None or decoder.shortcut is None:
         return
     cell, latent = encoder.shortcut.stride[0], encoder.shortcut.out_channels
-    maps = _split_cells(compute_smooth_maps(height, occupied, cell), cell)  # (cells, pixels)
-    heights, distances = torch.ones(2, maps.shape[1] // 2, dtype=maps.dtype)
-    weight = torch.cat([HEIGHT_WEIGHT * heights, distances])  # Weights for the principal components.
-    mean = maps.mean(dim=0)
-    components, deviation = compute_principal_components((maps - mean) * weight, latent)
-    encode = weight[:, None] * components / deviation
-    decode = (deviation * components).T / weight
+    maps = split_cells(compute_smooth_maps(height, occupied, cell), cell)  # (cells, pixels)
+    heights, distances = torch.ones(2, maps.shape[1] // 2, dtype=maps.dtype, device=maps.device)
+    mean, encode, decode = compute_linear_autoencoder(maps, latent)
     rebuilt = (maps - mean) @ encode @ decode + mean
-    inside = (_split_cells(occupied, cell) > 0.5).to(maps.dtype)
+    inside = (split_cells(occupied, cell) > 0.5).to(maps.dtype)
     error = {
         logit: F.binary_cross_entropy_with_logits(
             logit * compute_edge_reach_px(cell) * rebuilt[:, maps.shape[1] // 2 :], inside
@@ -146,7 +170,10 @@ def init_from_data(
 
 
 def compute_smooth_maps(
-    height: Float[Tensor, "batch ground rows cols"], occupied: Float[Tensor, "batch ground rows cols"], cell: int
+    height: Float[Tensor, "batch ground rows cols"],
+    occupied: Float[Tensor, "batch ground rows cols"],
+    cell: int,
+    distance_px: Float[Tensor, "batch ground rows cols"] | None = None,
 ) -> Float[Tensor, "batch maps rows cols"]:
     """Convert rasters to smooth maps: heights without gaps, and signed distances instead of masks.
 
@@ -157,13 +184,15 @@ def compute_smooth_maps(
         height: Normalised heights.
         occupied: Masks, 0 or 1.
         cell: Side of a latent cell in pixels.
+        distance_px: Signed distances up to `compute_edge_reach_px`, in pixels; None: compute them.
 
     Returns:
         Filled heights and signed distances in [-1, 1], concatenated along the channel axis. A value of 1 stands for a
         distance of `compute_edge_reach_px` pixels.
     """
-    distance = compute_signed_distance_px(occupied > 0.5, compute_edge_reach_px(cell)) / compute_edge_reach_px(cell)
-    return torch.cat([fill_heights(height, occupied, cell), distance.to(height.dtype)], dim=1)
+    reach = compute_edge_reach_px(cell)
+    distance = compute_signed_distance_px(occupied > 0.5, reach) if distance_px is None else distance_px
+    return torch.cat([fill_heights(height, occupied, cell), (distance / reach).to(height.dtype)], dim=1)
 
 
 def compute_edge_reach_px(cell: int) -> int:
@@ -178,35 +207,16 @@ def compute_edge_reach_px(cell: int) -> int:
     return max(1, cell // 2)
 
 
-def compute_signed_distance_px(
-    inside: Bool[Tensor, "*batch rows cols"], most: int
-) -> Float[Tensor, "*batch rows cols"]:
-    """Compute the Euclidean distance from pixel centres to the edge of a mask, positive inside the mask.
-
-    The edge lies halfway between the last pixel of the mask and the first pixel outside the mask. The method is that of
-    Felzenszwalb & Huttenlocher (2012), restricted to a window.
+def split_cells(maps: Float[Tensor, "batch maps rows cols"], cell: int) -> Float[Tensor, "cells pixels"]:
+    """Split maps into latent cells.
 
     Args:
-        inside: Masks.
-        most: Largest distance (pixels); larger distances are clipped to this value.
+        maps: Maps.
+        cell: Side of a latent cell in pixels.
 
     Returns:
-        Signed distances in pixels.
+        Pixels of each cell as float64, in the order (map, row, col).
     """
-    squared = torch.stack([inside, ~inside]).float() * (most + 0.5) ** 2  # squared distances
-    for axis in (-1, -2):
-        padded = F.pad(squared, (most, most, 0, 0) if axis == -1 else (0, 0, most, most), value=(most + 0.5) ** 2)
-        nearest = squared
-        for step in range(1, most + 1):
-            for start in (most - step, most + step):
-                nearest = torch.minimum(nearest, padded.narrow(axis, start, squared.shape[axis]) + step**2)
-        squared = nearest
-    to_outside, to_inside = squared.sqrt()
-    return torch.where(inside, to_outside - 0.5, 0.5 - to_inside)
-
-
-def _split_cells(maps: Float[Tensor, "batch maps rows cols"], cell: int) -> Float[Tensor, "cells pixels"]:
-    """Return the pixels of each latent cell as float64, in the order (map, row, col)."""
     pixels = F.pixel_unshuffle(maps, cell)
     return pixels.permute(0, 2, 3, 1).reshape(-1, pixels.shape[1]).double()
 
@@ -232,6 +242,26 @@ def fill_heights(
     mean = torch.where(count > 0, total / count.clamp(min=1e-6), scene[:, None, None, None])
     mean = mean.repeat_interleave(cell, dim=2).repeat_interleave(cell, dim=3)
     return torch.where(occupied > 0, height, mean)
+
+
+def compute_linear_autoencoder(
+    maps: Float[Tensor, "cells pixels"], latent: int
+) -> tuple[Float[Tensor, " pixels"], Float[Tensor, "pixels latent"], Float[Tensor, "latent pixels"]]:
+    """Compute the best linear autoencoder of cells of smooth maps, whose latents have unit variance.
+
+    Args:
+        maps: Smooth maps of cells (`compute_smooth_maps`); the first half of each row are heights.
+        latent: Number of latent values of a cell.
+
+    Returns:
+        Mean of the maps, matrix of the encoder and matrix of the decoder: latent = (maps - mean) @ encode, and
+        maps = latent @ decode + mean.
+    """
+    weight = torch.ones(maps.shape[1], dtype=maps.dtype, device=maps.device)
+    weight[: maps.shape[1] // 2] = HEIGHT_WEIGHT
+    mean = maps.mean(dim=0)
+    components, deviation = compute_principal_components((maps - mean) * weight, latent)
+    return mean, weight[:, None] * components / deviation, (deviation * components).T / weight
 
 
 def compute_principal_components(

@@ -15,6 +15,7 @@ from models.vae.matching import match_primitives
 from models.vae.outputs import LayoutOutput, Posterior, Prediction
 
 OCCUPANCY_WEIGHT, HEIGHT_WEIGHT, KL_WEIGHT = 1.0, 9.0, 1e-6
+DISTANCE_WEIGHT = 2.0  # Weight of the signed distances of level sets, which the paper does not have.
 
 # Weights of the losses of existence, centre and Cholesky parameters (paper, supplement B.2).
 LOW, MEDIUM, HIGH = (1.0, 3.0, 2.0), (3.0, 9.0, 7.0), (5.0, 15.0, 12.0)
@@ -45,6 +46,7 @@ class LVAELoss:
         cholesky: Cholesky loss.
         kl: KL loss.
         auxiliary: Object losses of the other layers and of the denoising queries, if the object decoder has them.
+        distance: Loss of the signed distances, if the ground decoder has level sets.
     """
 
     occupancy: Tensor
@@ -54,11 +56,15 @@ class LVAELoss:
     cholesky: Tensor
     kl: Tensor
     auxiliary: Tensor
+    distance: Tensor
 
     @property
     def total(self) -> Tensor:
         """Sum of all parts."""
-        return self.occupancy + self.height + self.existence + self.center + self.cholesky + self.kl + self.auxiliary
+        return sum(
+            (self.occupancy, self.height, self.existence, self.center, self.cholesky, self.kl, self.auxiliary),
+            self.distance,
+        )
 
     def items(self) -> dict[str, Tensor]:
         """Return the parts by name, and the total as `loss`."""
@@ -76,6 +82,22 @@ def compute_occupancy_loss(logit: Float[Tensor, "b g h w"], occupied: Float[Tens
         Scalar loss.
     """
     return F.binary_cross_entropy_with_logits(logit, occupied)
+
+
+def compute_distance_loss(distance: Float[Tensor, "b g h w"], truth: Float[Tensor, "b g h w"]) -> Float[Tensor, ""]:
+    """Compute the L1 loss of signed distances, averaged over pixels, classes and batch.
+
+    The truth is clipped to [-1, 1]. Where it is clipped, only predictions nearer to the edge have a loss.
+
+    Args:
+        distance: Predicted signed distances.
+        truth: True signed distances, clipped to [-1, 1].
+
+    Returns:
+        Scalar loss.
+    """
+    beyond = (truth.abs() >= 1) & (distance * truth.sign() >= 1)
+    return ((distance - truth).abs() * ~beyond).mean()
 
 
 def compute_height_loss(
@@ -193,6 +215,10 @@ def compute_lvae_loss(
     for found in output.denoised:
         _, *distances = compute_losses(found, len(found.features) // len(batch))
         auxiliary = auxiliary + sum(distances)
+    distance = existence.new_zeros(())
+    if output.signed_distance is not None:
+        target = batch.measure_distances_px(output.reach_px) / output.reach_px
+        distance = DISTANCE_WEIGHT * compute_distance_loss(output.signed_distance, target)
     return LVAELoss(
         occupancy=ground * OCCUPANCY_WEIGHT * compute_occupancy_loss(output.occupancy_logit, batch.occupied),
         height=ground * HEIGHT_WEIGHT * compute_height_loss(output.height, batch.height, batch.occupied),
@@ -201,4 +227,5 @@ def compute_lvae_loss(
         cholesky=cholesky,
         kl=kl_weight * compute_kl_loss(posterior),
         auxiliary=auxiliary,
+        distance=distance,
     )

@@ -89,6 +89,9 @@ class LayoutOutput:
         branches: Branches of the model. The outputs of a missing branch are placeholders.
         auxiliary: See `Proposals`.
         denoised: See `Proposals`.
+        signed_distance: Signed distances from the edges of the masks in units of `reach_px` pixels, positive inside;
+            None for models without level sets.
+        reach_px: Unit of `signed_distance` in pixels.
     """
 
     height: Float[Tensor, "batch ground rows cols"]
@@ -101,6 +104,8 @@ class LayoutOutput:
     branches: str = "both"
     auxiliary: tuple[Prediction, ...] = ()
     denoised: tuple[Prediction, ...] = ()
+    signed_distance: Float[Tensor, "batch ground rows cols"] | None = None
+    reach_px: int = 1
 
     def float(self) -> LayoutOutput:
         """Convert to float32, because losses need more precision than bfloat16."""
@@ -109,7 +114,9 @@ class LayoutOutput:
             name: tuple(Prediction(*(part.float() for part in found)) for found in getattr(self, name))
             for name in ("auxiliary", "denoised")
         }
-        return replace(self, **{name: getattr(self, name).float() for name in names}, **further)
+        distance = None if self.signed_distance is None else self.signed_distance.float()
+        changed = {name: getattr(self, name).float() for name in names}
+        return replace(self, **changed, **further, signed_distance=distance)
 
     def layouts(self) -> list[DecodedLayout]:
         """Return one numpy layout per sample, with probabilities instead of logits."""
