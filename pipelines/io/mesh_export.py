@@ -1,8 +1,10 @@
 """Convert a Scene to meshes: layout reconstruction (paper, supplement B.2), GLB files and PLY files.
 
-The ground is one fused surface. Each occupied pixel becomes a vertex at the pixel centre, with the colour of the
-pixel's class. Each 2 x 2 block of occupied pixels becomes two triangles. The diagonal has the same direction in all
-blocks. A primitive is a unit cuboid or a unit ellipsoid (diameter 1), transformed by T = [R diag(l, w, h) | t].
+The ground is one fused surface. In files, the classes have smooth borders (geometry/ground_polygons.py). In the layout
+reconstruction, each occupied pixel becomes a vertex at the pixel centre, with the colour of the pixel's class. Each
+2 x 2 block of occupied pixels becomes two triangles. The diagonal has the same direction in all blocks.
+
+A primitive is a unit cuboid or a unit ellipsoid (diameter 1), transformed by T = [R diag(l, w, h) | t].
 """
 
 from __future__ import annotations
@@ -21,8 +23,10 @@ import trimesh.exchange.ply
 import trimesh.visual
 
 from models.scene import CATEGORIES, ELLIPSOID, Scene
+from pipelines.geometry.ground_polygons import build_smooth_ground
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
 
+SMOOTH_BORDERS = "smooth_borders"  # Extra of a ground mesh that has vertices between pixel centres.
 GROUND = -1  # Value of `primitive` for a ground triangle.
 ABOUT = (  # Fields of the scene in the `extras` of a glTF file.
     *("scene_id", "source", "sequence", "frame", "split", "world_xyz_m", "world_yaw_rad"),
@@ -107,6 +111,27 @@ def build_ground_mesh(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return vertices, triangles, list_ground_ids(scene)[winner[occupied]]
 
 
+def build_painted_ground(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Build the mesh of the fused ground surface with smooth borders and one class per vertex.
+
+    At a border, each class has its own vertices at the same place. Colours therefore change without a blend.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        vertices_m (v, 3) in the scene frame; triangles (t, 3), which face up; and vertex_class_id (v,).
+    """
+    mesh = build_smooth_ground(scene)
+    num_classes = len(scene.ground_classes)
+    key = mesh.triangles * num_classes + mesh.class_index[:, None]
+    used = np.zeros(len(mesh.vertices_m) * num_classes, bool)
+    used[key] = True
+    place = np.flatnonzero(used)
+    class_id = list_ground_ids(scene)[place % num_classes]
+    return mesh.vertices_m[place // num_classes], (np.cumsum(used) - 1)[key], class_id
+
+
 def triangulate_ground(scene: Scene) -> Triangles:
     """Return the triangles of `build_ground_mesh`.
 
@@ -170,7 +195,7 @@ def export_glb(scene: Scene) -> bytes:
 
     The node `scene` holds the rotation from z up to y up. The children of this node are therefore in the scene frame:
 
-    * `ground` has vertex colours. This node is absent if no pixel is occupied.
+    * `ground` has vertex colours, and smooth borders between its classes. This node is absent if no pixel is occupied.
     * `<category>_<index>` is the node of a primitive. The extras of the node hold category, class id, colour, label,
       instance id and the exact parameters.
 
@@ -187,13 +212,10 @@ def export_glb(scene: Scene) -> bytes:
     about = {name: getattr(scene, name) for name in ABOUT} | {"grid": asdict(scene.grid)}
     world = trimesh.Scene(metadata=about)
     world.graph.update("scene", "world", matrix=GLTF_FROM_SCENE)
-    vertices, triangles, class_id = build_ground_mesh(scene)
+    vertices, triangles, class_id = build_painted_ground(scene)
     if len(vertices):
-        # trimesh omits meshes without triangles. Each isolated pixel would otherwise be lost, so it is written as a
-        # triangle without area.
-        triangles = triangles if len(triangles) else np.zeros((1, 3), int)
         world.geometry["ground"] = _paint_mesh(vertices, triangles, class_id)
-        extras = {"classes": {name: f"#{COLOR_HEX[name]}" for name in scene.ground_classes}}
+        extras = {"classes": {name: f"#{COLOR_HEX[name]}" for name in scene.ground_classes}, SMOOTH_BORDERS: True}
         world.graph.update("ground", "scene", matrix=np.eye(4), geometry="ground", metadata=extras)
     for category in np.unique(scene.category):
         world.geometry[CATEGORIES[category]] = _make_unit_mesh(category)
@@ -224,7 +246,7 @@ def export_ply(scene: Scene) -> bytes:
     Returns:
         Content of the .ply file.
     """
-    ground_m, triangles, class_id = build_ground_mesh(scene)
+    ground_m, triangles, class_id = build_painted_ground(scene)
     vertices, faces, classes, primitives = [ground_m], [triangles], [class_id], [np.full(len(ground_m), GROUND)]
     count = len(ground_m)
     for index, transform in enumerate(compute_placements(scene)):

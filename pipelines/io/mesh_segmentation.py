@@ -16,6 +16,7 @@ from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, CLASS_ID, EMPTY
 COLOR_TOLERANCE = 12  # Tolerance per channel (0 to 255). Dark colours in 8-bit linear light have errors of up to 7.
 FAR = 64  # The colour distance of a vertex is clipped to this value when sRGB and linear light are compared.
 ON_GRID_PX = 0.02  # Maximum distance of a ground vertex from a pixel's corner or centre.
+MIN_CENTERS = 0.1  # Minimum share of the vertices at pixel centres in an export with smooth borders.
 MAX_MIXED = 0.5  # Maximum share of ground vertices whose colour lies between two classes.
 VEGETATION = (int(CATEGORY_IDS[0]), int(CATEGORY_IDS[ELLIPSOID]))  # Both vegetation classes have the same colour.
 CLASS_IDS = np.array(sorted(set(CLASS_ID.values()) - {VEGETATION[1]}))
@@ -287,6 +288,25 @@ def rasterize_ground(
     occupied = np.isfinite(height_m)
     height_m[~occupied] = 0
     return height_m, occupied
+
+
+def find_pixel_centers(vertices_m: np.ndarray, grid: Grid) -> np.ndarray:
+    """Find the ground vertices at pixel centres. The other vertices of an export lie on the borders of classes.
+
+    Args:
+        vertices_m: (v, 3) vertices in the scene frame (m).
+        grid: Raster grid.
+
+    Returns:
+        (v,) bool. If a vertex lies outside the grid, or if fewer than MIN_CENTERS of the vertices are found, the mesh
+        is no such export: all are True.
+    """
+    at_px = (np.array([grid.front_m, grid.left_m]) - vertices_m[:, :2]) / grid.resolution_m
+    inside = (at_px >= -ON_GRID_PX) & (at_px <= np.array([grid.rows, grid.cols]) + ON_GRID_PX)
+    if not (len(inside) and inside.all()):
+        return np.ones(len(vertices_m), bool)
+    found = (np.abs(at_px - 0.5 - np.round(at_px - 0.5)) <= ON_GRID_PX).all(axis=1)
+    return found if found.mean() >= MIN_CENTERS else np.ones(len(vertices_m), bool)
 
 
 def _find_pixels(vertices_m: np.ndarray, grid: Grid) -> np.ndarray:

@@ -24,6 +24,7 @@ from pipelines.io.mesh_export import (
     GLTF_FROM_SCENE,
     GROUND,
     build_ground_mesh,
+    build_painted_ground,
     compute_placements,
     export_glb,
     triangulate_scene,
@@ -100,6 +101,7 @@ def test_ground_mesh_is_fused_surface_at_pixel_centers():
     assert ((at_row % 5 == 0) & (at_col % 5 == 0)).sum() == quads
 
     loaded = place_mesh(load_glb(export_glb(scene)), "ground")
+    vertices, triangles, _ = build_painted_ground(scene)
     assert np.allclose(loaded.vertices, vertices, atol=1e-4) and np.array_equal(loaded.faces, triangles)
 
 
