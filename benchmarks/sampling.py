@@ -27,7 +27,7 @@ import tyro
 from common import describe_machine, spread
 
 from models.dit import DiT
-from models.labels import LABELS
+from models.labels import list_usual_labels
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline
@@ -72,7 +72,7 @@ def main(config: Config) -> None:
         sum(p.numel() * p.element_size() for m in (pipeline.lvae, pipeline.dit) for p in m.parameters()) / 2**20
     )
     print(describe_machine(), f"latents {pipeline.lvae.latent_shape}")
-    known = LABELS[pipeline.dit.config.label]
+    known = list_usual_labels(pipeline.dit.config.label)
     labels = [known[k % len(known)] for k in range(config.batch)]
     seconds: dict[str, list[float]] = {"sampling": [], "decoding": [], "writing": []}
 

@@ -31,9 +31,10 @@ class Config:
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     latents: str = ""
     """Directory with latents.json (default: the dataset directory)."""
-    label_kind: Literal["vegetation", "vehicle", "joint", "none"] | None = None
+    label_kind: Literal["vegetation", "vehicle", "joint", "partial", "none"] | None = None
     """Kind of label that the model is conditioned on (default: as in the paper, vegetation density, or vehicle density
-    if the dataset has no vegetation, such as Argoverse 2)."""
+    if the dataset has no vegetation, such as Argoverse 2). joint: both. partial: both, either alone or none, and
+    whether a scene is a view of a vehicle or a crop at any place."""
     name: str = ""
     """Name of the run; a run name is bound to its options (default: dit-<preset>)."""
     output: str = ""

@@ -23,8 +23,9 @@ from models.composition.inpaint import Contents, composite_scenes, grow_to_cells
 from models.composition.outpaint import BlockIndex, outpaint_scene
 from models.dit import DiT
 from models.execution import SamplingExecution
-from models.labels import find_label_index, split_label
+from models.labels import FREE, find_label_index, split_label
 from models.layout import LayoutSpec
+from models.limits import require_within
 from models.lvae import LayoutVAE
 from models.options import Choice, Number, Rule, Sequential, Text, check_entries, show_value
 from models.pretrained import INDEX_NAME, find_pipeline_path
@@ -364,6 +365,7 @@ class PrITTIPipeline:
         identities: Sequence[Scene],
         existence_threshold: float | None = None,
         deduplicate: bool = True,
+        raster_px: int | None = None,
     ) -> list[Scene]:
         """Decode latents to scenes.
 
@@ -377,19 +379,27 @@ class PrITTIPipeline:
                 the pipeline.
             deduplicate: A cell decoder may propose the same object in two cells. If True, only the proposal with the
                 higher existence probability is kept.
+            raster_px: Number of rows and of columns of the rasters; None: that of the model's grid. Only models whose
+                ground consists of level sets decode another resolution.
 
         Returns:
             One scene per latent.
 
         Raises:
-            ValueError: The threshold is not between 0 and 1, or a latent holds NaN or infinity.
+            ValueError: The threshold is not between 0 and 1, a latent holds NaN or infinity, or the model has no level
+                sets and `raster_px` is not its resolution.
         """
         threshold = self.resolve_existence_threshold(existence_threshold)
         shift, scale = self._moments()
         if not torch.isfinite(latents).all():  # Decoded, such a latent would give an empty scene.
             raise ValueError("a latent holds NaN or infinity: the weights of the model are damaged")
         spec, parts = self.spec, latents.split(self.execution.decode_batch_size)
-        layouts = [layout for part in parts for layout in self.lvae.decode(part * scale + shift).layouts()]
+        if raster_px is not None:
+            require_within("raster_pixels", raster_px**2 * len(spec.ground_classes), "raster_px")
+            spec = spec.with_resolution(raster_px)
+        layouts = [
+            layout for part in parts for layout in self.lvae.decode(part * scale + shift, raster_px=raster_px).layouts()
+        ]
         scenes = [
             decode_layout(layout, spec, identity, threshold)
             for layout, identity in zip(layouts, identities, strict=True)
@@ -419,6 +429,7 @@ class PrITTIPipeline:
             self.spec,
             vegetation_density=vegetation,
             vehicle_density=vehicle,
+            free_pose=label.endswith(FREE),
         )
 
     def label_tensor(self, labels: Sequence[str]) -> Tensor:

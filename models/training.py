@@ -28,6 +28,7 @@ from models.base import ConfiguredModel
 from models.batch import LayoutBatch
 from models.dit import DiT
 from models.execution import require_bf16
+from models.labels import PART_DROPOUT, list_dropped_labels
 from models.layout import FEATURES, LayoutSpec
 from models.lvae import LayoutVAE
 from models.presets import DiTPreset, LVAEPreset
@@ -325,7 +326,8 @@ def make_diffusion_loss(
     """Return the loss function of stage 2 (training of the DiT): mean squared error of the noise (Eq. "LDM").
 
     With v-prediction, the error is weighted by `DiT.loss_weight`. Each step samples new latents from the cached
-    posteriors. Labels are dropped once per sample.
+    posteriors. Labels are dropped once per sample. Before, a partial label loses each density with the probability
+    PART_DROPOUT.
 
     Args:
         dit: Model on its device, which defines the noise schedule.
@@ -339,6 +341,8 @@ def make_diffusion_loss(
     shape = (dit.config.channels, dit.config.size, dit.config.size)
     shift = torch.tensor(dit.config.shift or [0.0] * shape[0], device=dit.device)[:, None, None]
     scale = torch.tensor(dit.config.scale or [1.0] * shape[0], device=dit.device)[:, None, None]
+    parts = list_dropped_labels(dit.config.label)
+    remaining = None if parts is None else torch.tensor(parts, device=dit.device)
 
     def loss(
         model: Callable[..., Any], arrays: dict[str, Tensor], generators: list[torch.Generator]
@@ -347,9 +351,12 @@ def make_diffusion_loss(
         device = mean.device
         # No line below waits for a GPU. Random numbers are thus drawn during the backward pass of the previous step.
         posterior_noise, noise = sample_noise(generators, shape, device, count=2)
-        uniform = sample_uniform(generators, 2, device)
+        uniform = sample_uniform(generators, 2 if remaining is None else 4, device)
         latent = (mean + (0.5 * logvar).exp() * posterior_noise - shift) / scale
         timestep = sample_timesteps(uniform[:, 0], timestep_sampling, diffusion.num_timesteps)
+        if remaining is not None:
+            dropped = (uniform[:, 2:] < PART_DROPOUT).long()
+            label = remaining[label, dropped[:, 0] + 2 * dropped[:, 1]]
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
         predicted = model(diffusion.add_noise(latent, noise, timestep), timestep, label)
         error = F.mse_loss(predicted.float(), noise, reduction="none").flatten(1).mean(1)

@@ -88,7 +88,7 @@ def resolve_label_kind(config: DiTConfig, dataset: Dataset) -> str:
         if not {CATEGORIES[k] for k in group} & set(dataset.spec.categories)
     }
     kind = config.label_kind or ("vehicle" if "vegetation" in lacks else "vegetation")
-    if missing := lacks & (set(DENSITY_GROUPS) if kind == "joint" else {kind}):
+    if missing := lacks & (set(DENSITY_GROUPS) if kind in ("joint", "partial") else {kind}):
         known = [name for name in (*DENSITY_GROUPS, "none") if name not in lacks]
         raise ValueError(
             f"--label-kind {kind}: {dataset.root} has no objects of the group {' or '.join(sorted(missing))}, so all"

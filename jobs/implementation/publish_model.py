@@ -17,7 +17,7 @@ from jobs.support.model_files import publish_directory
 from jobs.support.outputs import hold_lease
 from jobs.support.registry import EXPERIMENT, PIPELINE, register_version
 from jobs.support.tracking import Tracker, find_tracking_uri, hide_credentials, make_client
-from models.labels import LABELS
+from models.labels import list_usual_labels
 from models.pipeline import PrITTIPipeline
 from models.pretrained import CHECKSUMS_NAME, TRAINING_NAME, WEIGHTS, compute_checksums
 from models.tensors import EXISTENCE_THRESHOLD
@@ -88,7 +88,16 @@ def write_entry(
     pipeline.save_pretrained(directory)
     sums, kind = compute_checksums(directory), pipeline.dit.config.label
     card = ModelCard(
-        name, version, kind, LABELS[kind], trainings, facts, about["sampling"], about["real_split"], scores, sums
+        name,
+        version,
+        kind,
+        list_usual_labels(kind),
+        trainings,
+        facts,
+        about["sampling"],
+        about["real_split"],
+        scores,
+        sums,
     )
     storage.write_text(card.markdown(), f"{directory}/README.md")
     storage.write_json(sums, f"{directory}/{CHECKSUMS_NAME}")

@@ -11,7 +11,7 @@ from jobs.support.model_directories import find_pipeline_directory, read_label_k
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from models.execution import SamplingExecution
-from models.labels import LABELS
+from models.labels import list_usual_labels
 from pipelines.generation.sample import SampleRequest, sample_scenes
 from pipelines.io.mesh_export import export_glb
 from pipelines.runtime import storage
@@ -29,7 +29,7 @@ def sample(config: Config) -> str:
         output=output,
         run=config.run,
         num_scenes=config.num_scenes,
-        labels=config.labels or LABELS[read_label_kind(model)],
+        labels=config.labels or list_usual_labels(read_label_kind(model)),
         seed=config.seed,
         num_inference_steps=config.num_inference_steps,
         guidance_scale=config.guidance_scale,

@@ -14,7 +14,7 @@ from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.terminal import print_table
 from jobs.sweep_samplers import Config
-from models.labels import LABELS
+from models.labels import list_usual_labels
 from models.pipeline import check_noise_scaling
 from models.sampling.diffusion import Diffusion
 from models.sampling.schedulers import SAMPLERS
@@ -69,7 +69,7 @@ def sweep_samplers(config: Config) -> list[dict]:
             f" {count}: give another split, or fewer --num-scenes"
         )
     others = replace(others, limit=count)
-    labels = LABELS[read_label_kind(model)]
+    labels = list_usual_labels(read_label_kind(model))
     rows, pictures = [], []
     with hold_output(output, "evaluation", config):
         with JobProgress() as bar:

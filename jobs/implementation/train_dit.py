@@ -34,7 +34,7 @@ from jobs.support.value_names import RECORDED_PREDICTIONS, RECORDED_TIMESTEPS
 from jobs.train_dit import Config
 from jobs.train_lvae import Config as LVAEConfig
 from models.dit import DiT
-from models.labels import LABELS
+from models.labels import LABELS, list_usual_labels
 from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTPreset, find_preset
@@ -51,7 +51,7 @@ from pipelines.generation.sample import load_pipeline
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import Shard, find_shards
-from pipelines.training.data_loader import LatentReader, Stream, label_indices
+from pipelines.training.data_loader import LABEL_COLUMNS, LatentReader, Stream, label_indices
 from pipelines.training.latents import digest_weights, load_lvae
 
 
@@ -107,10 +107,11 @@ def check_training_labels(shards: list[Shard], kind: str) -> None:
     Raises:
         ValueError: All scenes have the same label although this kind has several.
     """
-    tables = [shard.read("scenes", ["vegetation_density", "vehicle_density"]) for shard in shards]
+    tables = [shard.read("scenes", list(LABEL_COLUMNS)) for shard in shards]
     counts = np.bincount(label_indices(pa.concat_tables(tables), kind), minlength=len(LABELS[kind]))
-    missing = [name for name, count in zip(LABELS[kind], counts, strict=True) if count == 0]
-    if len(counts) > 1 and len(missing) == len(counts) - 1:
+    named = set(list_usual_labels(kind))
+    missing = [name for name, count in zip(LABELS[kind], counts, strict=True) if count == 0 and name in named]
+    if len(counts) > 1 and (counts > 0).sum() == 1:
         raise ValueError(
             f"--label-kind {kind}: all {counts.sum()} training scenes have the label"
             f" {LABELS[kind][counts.argmax()]!r}; use another kind, or none"

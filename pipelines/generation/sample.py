@@ -200,7 +200,7 @@ def find_scene_label(scene: Scene, kind: str) -> str:
     Raises:
         ValueError: The scene has no such label.
     """
-    label = compose_label(kind, scene.vegetation_density, scene.vehicle_density)
+    label = compose_label(kind, scene.vegetation_density, scene.vehicle_density, scene.free_pose)
     if label is None or label not in LABELS[kind]:
         raise ValueError(
             f"scene {scene.scene_id} has no {kind} label; give one with --label ({', '.join(LABELS[kind])})"

@@ -1,28 +1,36 @@
-"""Export the roads of a Scene as ASAM OpenDRIVE 1.7: reference lines, elevation, driving lanes and junctions.
+"""Export the roads of a Scene as ASAM OpenDRIVE 1.7: reference lines, elevation, lanes, kerbs and junctions.
 
 Each road of centerlines.py becomes an OpenDRIVE road with at least one driving lane per side. The reference line of a
-road consists of cubic curves through points of the centreline. Roads end before a node. At each node, a connecting road
-leads from each road to every other road. The inertial frame of OpenDRIVE is the scene frame. The offset in the header
-is the position of the scene in the world frame. Traffic keeps to the right.
+road consists of cubic curves through points of the centreline. The lanes end at the border of the road's polygon
+(geometry/ground_polygons.py). Where a sidewalk adjoins, the border is a kerb and the sidewalk is a lane. Roads end
+before a node. At each node, a connecting road leads from each road to every other road. The inertial frame of OpenDRIVE
+is the scene frame. The offset in the header is the position of the scene in the world frame. Traffic keeps to the
+right.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import Any
 
 import numpy as np
+import shapely
 from scipy.interpolate import CubicSpline
 
-from models.scene import Scene
+from models.scene import ROAD_CLASSES, Scene
 from pipelines.geometry.centerlines import Road, RoadNetwork, extract_road_network
+from pipelines.geometry.ground_polygons import build_ground_polygons
 
 KNOT_M = 5.0  # Distance between points of a reference line.
 LANE_M = 3.5  # Approximate lane width, which determines the number of lanes per side.
 LEAST_ROAD_M = 2.0  # Minimum length of a road between two junctions.
 CLEAR = 1.3  # Distance from a node to the road ends, as a multiple of the half width of the widest road.
+WIDEST = 1.15  # Largest width of a side, as a multiple of half the usual width of the road. Forks are wider.
+NARROWEST = 0.5  # Smallest width of a side, as such a multiple.
+SIDEWALK_M = (0.8, 6.0)  # Smallest median width and largest width of a sidewalk lane.
+KERB_M = 0.12  # Height of a sidewalk lane above the road.
 SAMPLES = 64  # Number of samples that measure the length of a cubic curve.
 
 
@@ -36,21 +44,23 @@ class ReferenceLine:
         curve: Map from cumulative chord length to x, y and z in the scene frame (m).
         breaks: Cumulative chord length at each knot (m).
         lengths_m: Length of the curve between successive knots, seen from above (m).
-        width_m: Width of the whole road at each knot (m).
+        sides_m: Width of the left and the right side of the road at each knot (m).
+        sidewalks_m: Width of the left and the right sidewalk at each knot (m); 0: there is none.
     """
 
     curve: CubicSpline
     breaks: np.ndarray  # (k,)
     lengths_m: np.ndarray  # (k - 1,)
-    width_m: np.ndarray  # (k,)
+    sides_m: np.ndarray  # (k, 2)
+    sidewalks_m: np.ndarray  # (k, 2)
 
     @staticmethod
-    def through(xyz_m: np.ndarray, width_m: np.ndarray, tangents: np.ndarray | None = None) -> ReferenceLine:
+    def through(xyz_m: np.ndarray, sides_m: np.ndarray, tangents: np.ndarray | None = None) -> ReferenceLine:
         """Fit a curve through points.
 
         Args:
             xyz_m: (k, 3) points in the scene frame (m), k >= 2.
-            width_m: (k,) width of the whole road at the points (m).
+            sides_m: (k, 2) width of the left and the right side of the road at the points (m).
             tangents: (2, 2) unit directions at the first and last point, seen from above. None: the directions at the
                 ends are free.
 
@@ -66,7 +76,12 @@ class ReferenceLine:
         curve = CubicSpline(breaks, xyz_m, bc_type=ends)
         at = breaks[:-1, None] + np.diff(breaks)[:, None] * (np.arange(SAMPLES) + 0.5) / SAMPLES
         speed = np.linalg.norm(curve(at, 1)[..., :2], axis=-1)
-        return ReferenceLine(curve, breaks, speed.mean(axis=1) * np.diff(breaks), width_m)
+        return ReferenceLine(curve, breaks, speed.mean(axis=1) * np.diff(breaks), sides_m, np.zeros_like(sides_m))
+
+    @property
+    def width_m(self) -> np.ndarray:
+        """Width of the whole road at each knot (k,), in metres."""
+        return self.sides_m.sum(axis=1)
 
     @property
     def length_m(self) -> float:
@@ -91,13 +106,14 @@ class ReferenceLine:
         return self.curve(self.breaks[which]), direction / np.linalg.norm(direction)
 
 
-def fit_reference_lines(network: RoadNetwork) -> list[ReferenceLine]:
-    """Fit a curve to each road.
+def fit_reference_lines(network: RoadNetwork, scene: Scene) -> list[ReferenceLine]:
+    """Fit a curve to each road, and measure its sides and sidewalks along the curve.
 
     Roads are shortened at junctions.
 
     Args:
-        network: Roads and nodes.
+        network: Roads and nodes of the scene.
+        scene: Scene whose ground has the borders of the roads.
 
     Returns:
         One curve per road, in the order of the roads.
@@ -106,8 +122,16 @@ def fit_reference_lines(network: RoadNetwork) -> list[ReferenceLine]:
         CLEAR * max(float(np.median(road.width_m)) for road in network.list_leaving(node)) / 2
         for node in range(len(network.nodes_m))
     ]
+    shapes = build_ground_polygons(scene)
+    area = shapely.union_all([shapes[name] for name in ROAD_CLASSES if name in shapes])
+    sidewalk = shapes.get("sidewalk", shapely.MultiPolygon())
+    shapely.prepare([area, sidewalk])
     return [
-        _shorten_road(road, *(clear_m[node] if node >= 0 else 0.0 for node in (road.start, road.end)))
+        _fit_sides(
+            _shorten_road(road, *(clear_m[node] if node >= 0 else 0.0 for node in (road.start, road.end))),
+            area,
+            sidewalk,
+        )
         for road in network.roads
     ]
 
@@ -119,8 +143,42 @@ def _shorten_road(road: Road, from_start_m: float, from_end_m: float) -> Referen
     at = np.linspace(low, high, max(2, round((high - low) / KNOT_M) + 1))
     xyz_m = np.stack([np.interp(at, along, road.xyz_m[:, axis]) for axis in range(3)], axis=1)
     usual_m = np.median(road.width_m)  # At a fork, the mask is wider than each of the roads.
-    width_m = np.interp(at, along, np.minimum(road.width_m, 1.15 * usual_m))
-    return ReferenceLine.through(xyz_m, width_m)
+    width_m = np.interp(at, along, np.minimum(road.width_m, WIDEST * usual_m))
+    return ReferenceLine.through(xyz_m, width_m[:, None] * [0.5, 0.5])
+
+
+def _fit_sides(line: ReferenceLine, area: shapely.Geometry, sidewalk: shapely.Geometry) -> ReferenceLine:
+    """Measure the sides of a road and its sidewalks across the line at each knot.
+
+    A side whose border is far from the usual one, as at a fork or at the scene's border, keeps half the road's width.
+    """
+    usual_m = float(np.median(line.width_m)) / 2
+    place, ahead = line.curve(line.breaks)[:, :2], line.curve(line.breaks, 1)[:, :2]
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.linalg.norm(ahead, axis=1, keepdims=True)
+    sides_m, sidewalks_m = line.sides_m.copy(), np.zeros_like(line.sides_m)
+    for side, across in enumerate((left, -left)):
+        reach = _measure_reach(place, across, area, 2 * WIDEST * usual_m)
+        plausible = (reach >= NARROWEST * usual_m) & (reach <= WIDEST * usual_m)
+        sides_m[plausible, side] = reach[plausible]
+        start = place + (sides_m[:, side] + 0.05)[:, None] * across
+        walk = _measure_reach(start, across, sidewalk, SIDEWALK_M[1])
+        if np.median(walk) >= SIDEWALK_M[0]:
+            sidewalks_m[:, side] = walk
+    return replace(line, sides_m=sides_m, sidewalks_m=sidewalks_m)
+
+
+def _measure_reach(start: np.ndarray, direction: np.ndarray, area: shapely.Geometry, most_m: float) -> np.ndarray:
+    """Return the distance (k,) from points (k, 2) to the border of an area along unit directions (k, 2).
+
+    The distance is 0 for points outside the area, and at most `most_m`.
+    """
+    rays = shapely.linestrings(np.stack([start, start + most_m * direction], axis=1))
+    inside = shapely.intersection(rays, area)
+    first = [
+        next((p for p in shapely.get_parts(s) if p.distance(shapely.Point(a)) < 1e-6), None)
+        for s, a in zip(inside, start, strict=True)
+    ]
+    return np.array([0.0 if part is None else part.length for part in first])
 
 
 def list_lanes(line: ReferenceLine) -> int:
@@ -150,7 +208,7 @@ def export_opendrive(scene: Scene) -> bytes:
     network = extract_road_network(scene)
     if not network.roads:
         raise ValueError(f"scene {scene.scene_id} has no road to export")
-    lines = fit_reference_lines(network)
+    lines = fit_reference_lines(network, scene)
     root = ET.Element("OpenDRIVE")
     _make_header(root, scene)
     for number, (road, line) in enumerate(zip(network.roads, lines, strict=True)):
@@ -248,12 +306,20 @@ def _make_road_body(
                 ET.SubElement(link, "predecessor", id=str(links[0] * k))
                 ET.SubElement(link, "successor", id=str(links[1] * k))
             if sign:
-                _make_widths(lane, line, max(left, right))
+                at = 0 if sign > 0 else 1
+                _make_widths(lane, line, line.sides_m[:, at] / max(left, right))
+                if k == count and line.sidewalks_m[:, at].any():
+                    ET.SubElement(lane, "roadMark", sOffset="0", type="curb", color="standard", width="0.15")
+        at = 0 if sign > 0 else 1
+        if sign and line.sidewalks_m[:, at].any():
+            walk = ET.Element("lane", id=str(sign * (count + 1)), type="sidewalk", level="false")
+            _make_widths(walk, line, line.sidewalks_m[:, at])
+            ET.SubElement(walk, "height", sOffset="0", inner=_format_number(KERB_M), outer=_format_number(KERB_M))
+            group.insert(0 if sign > 0 else len(group), walk)
 
 
-def _make_widths(lane: ET.Element, line: ReferenceLine, lanes: int) -> None:
+def _make_widths(lane: ET.Element, line: ReferenceLine, width_m: np.ndarray) -> None:
     """Write the width of a lane, which is linear between knots."""
-    width_m = line.width_m / 2 / lanes
     slope = np.diff(width_m) / line.lengths_m
     for s, a, b in zip(line.starts_m[:-1], width_m[:-1], slope, strict=True):
         ET.SubElement(lane, "width", sOffset=_format_number(s), a=_format_number(a), b=_format_number(b), c="0", d="0")
@@ -272,9 +338,11 @@ def _make_junction(root: ET.Element, network: RoadNetwork, lines: list[Reference
         (a_m, a_way), (b_m, b_way) = lines[come].end(come_end), lines[go].end(go_end)
         a_way, b_way = (a_way if come_end else -a_way), (-b_way if go_end else b_way)
         lanes = min(list_lanes(lines[come]), list_lanes(lines[go]))
-        width_m = np.array([lines[come].width_m[come_end], lines[go].width_m[go_end]])
-        width_m = width_m * lanes / [list_lanes(lines[come]), list_lanes(lines[go])]
-        line = ReferenceLine.through(np.stack([a_m, b_m]), width_m, np.stack([a_way, b_way]))
+        # The connecting road continues the right side of both roads, seen in the direction of travel.
+        right_m = [lines[come].sides_m[come_end, 1 if come_end else 0], lines[go].sides_m[go_end, 0 if go_end else 1]]
+        right_m = np.array(right_m) * lanes / [list_lanes(lines[come]), list_lanes(lines[go])]
+        sides_m = np.stack([right_m, right_m], axis=1)
+        line = ReferenceLine.through(np.stack([a_m, b_m]), sides_m, np.stack([a_way, b_way]))
         number = sum(1 for _ in root.iter("road"))
         road = _make_road(root, number, line, junction=int(_make_junction_id(node)))
         link = ET.SubElement(road, "link")

@@ -270,7 +270,7 @@ def _read_stored_layouts(shard: Shard) -> StoredLayouts:
 @lru_cache(maxsize=2 * WINDOW_SHARDS)
 def _read_latents(shard: Shard, latents_root: str, label: str) -> Arrays:
     table = Shard(latents_root, shard.source, shard.split, shard.number).read("latents")
-    scenes = shard.read("scenes", ["scene_id", "vegetation_density", "vehicle_density"])
+    scenes = shard.read("scenes", ["scene_id", *LABEL_COLUMNS])
     if table["scene_id"].to_pylist() != scenes["scene_id"].to_pylist():
         raise ValueError(
             f"{shard.path('latents')} is not aligned with {shard.path('scenes')}; encode the latents again"
@@ -279,10 +279,13 @@ def _read_latents(shard: Shard, latents_root: str, label: str) -> Arrays:
     return moments | {"label": label_indices(scenes, label)}
 
 
+LABEL_COLUMNS = ("vegetation_density", "vehicle_density", "free_pose")  # Columns that determine a label.
+
+
 def label_indices(scenes: pa.Table, label: str) -> np.ndarray:
     """Return (n,) int64: for each row of a scenes table, the index of its label in LABELS[label]."""
-    densities = zip(scenes["vegetation_density"].to_pylist(), scenes["vehicle_density"].to_pylist(), strict=True)
-    names = [compose_label(label, vegetation, vehicle) for vegetation, vehicle in densities]
+    parts = zip(*(scenes[name].to_pylist() for name in LABEL_COLUMNS), strict=True)
+    names = [compose_label(label, vegetation, vehicle, bool(free_pose)) for vegetation, vehicle, free_pose in parts]
     return np.array([find_label_index(label, str(name)) for name in names], np.int64)
 
 

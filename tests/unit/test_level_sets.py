@@ -7,7 +7,9 @@ from helpers import random_scene, small_spec
 from scipy import ndimage
 from scipy.interpolate import BSpline
 
+from models.dit import DiT
 from models.lvae import LayoutVAE
+from models.pipeline import PrITTIPipeline
 from models.presets import LVAE_PRESETS
 from models.tensors import make_layout_batch
 from models.vae.config import override_options
@@ -102,6 +104,21 @@ def test_level_sets_learn_and_have_gradients():
             assert (lvae.ground_decoder.log_slope.grad != 0).all()
         optimiser.step()
     assert losses[-1] < 0.6 * losses[0]
+
+
+def test_pipeline_decodes_other_resolutions():
+    lvae = make_level_set_lvae()
+    lvae.init_from_data(make_layout_batch([random_scene(i) for i in range(8)], small_spec()))
+    channels, size, _ = lvae.latent_shape
+    pipeline = PrITTIPipeline(lvae, DiT(channels=channels, size=size, width=16, depth=1, heads=2))
+    latents, identity = pipeline.encode([random_scene(1)]), [pipeline.new_identity("run", 0, 0, "low")]
+    own, fine = pipeline.decode(latents, identity)[0], pipeline.decode(latents, identity, raster_px=128)[0]
+    assert fine.grid.rows == 128 and fine.grid.resolution_m == own.grid.resolution_m / 4
+    assert own.ground_area_m2().sum() > 500
+    assert fine.ground_area_m2() == pytest.approx(own.ground_area_m2(), abs=0.02 * 64**2)
+    assert np.array_equal(own.center_m, fine.center_m)
+    with pytest.raises(ValueError, match="raster_px"):
+        pipeline.decode(latents, identity, raster_px=10**6)
 
 
 def test_level_sets_survive_saving(tmp_path):

@@ -7,6 +7,7 @@ from importlib.metadata import distribution
 
 import numpy as np
 import pytest
+import shapely
 import trimesh
 from helpers import random_scene
 from lxml import etree
@@ -14,6 +15,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from models.scene import ELLIPSOID, UNSET, Grid, Scene
 from pipelines.geometry.centerlines import extract_road_network, plan_drive
+from pipelines.geometry.ground_polygons import build_ground_polygons
 from pipelines.io.mesh_export import GROUND, triangulate_scene
 from pipelines.io.opendrive import export_opendrive, fit_reference_lines, list_lanes
 from pipelines.preprocess.sources.town.generator import generate_town
@@ -238,13 +240,34 @@ def sample_reference_line(road: ET.Element) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(points), np.concatenate(headings)
 
 
+def list_driving_lanes(road: ET.Element, side: str) -> list[ET.Element]:
+    return [lane for lane in road.findall(f"lanes/laneSection/{side}/lane") if lane.get("type") == "driving"]
+
+
+def test_opendrive_kerbs_lie_on_borders_of_road(town_scenes):
+    gaps, walks = [], 0
+    for scene in town_scenes:
+        shapes = build_ground_polygons(scene)
+        for line in fit_reference_lines(extract_road_network(scene), scene):
+            place, ahead = line.curve(line.breaks)[:, :2], line.curve(line.breaks, 1)[:, :2]
+            left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.linalg.norm(ahead, axis=1, keepdims=True)
+            kerbs = np.concatenate([place + line.sides_m[:, :1] * left, place - line.sides_m[:, 1:] * left])
+            gaps += shapely.distance(shapes["road"].boundary, shapely.points(kerbs)).tolist()
+            walks += int((line.sidewalks_m > 0).any(axis=0).sum())
+        root = ET.fromstring(export_opendrive(scene))
+        kinds = [lane.get("type") for lane in root.iter("lane")]
+        marks = sum(mark.get("type") == "curb" for mark in root.iter("roadMark"))
+        assert kinds.count("sidewalk") == marks > 0
+    assert np.median(gaps) < 0.01 and np.mean(np.array(gaps) < 0.3) > 0.8 and walks > 5
+
+
 def test_opendrive_follows_schema_and_centerlines(town_scenes, schema):
     counted = 0
     for scene in [*town_scenes, make_scene_of_roads([STRAIGHT, SIDE], 12.5)]:
         content = export_opendrive(scene)
         schema.assertValid(etree.fromstring(content))
         network, root = extract_road_network(scene), ET.fromstring(content)
-        lines = fit_reference_lines(network)
+        lines = fit_reference_lines(network, scene)
         roads = root.findall("road")
         assert root.find("header/offset").get("hdg") is not None and len(roads) >= len(lines)
         for element, road, line in zip(roads, network.roads, lines, strict=False):
@@ -256,11 +279,11 @@ def test_opendrive_follows_schema_and_centerlines(town_scenes, schema):
             assert np.abs(np.angle(np.exp(1j * np.diff(headings)))).max() < 0.05  # headings change smoothly
             assert float(element.get("length")) == pytest.approx(line.length_m)
             width_m = [
-                sum(float(lane.find("width").get("a")) for lane in element.findall(f"lanes/laneSection/{side}/lane"))
+                sum(float(lane.find("width").get("a")) for lane in list_driving_lanes(element, side))
                 for side in ("left", "right")
             ]
             assert sum(width_m) == pytest.approx(line.width_m[0], rel=1e-6)
-            assert len(element.findall("lanes/laneSection/right/lane")) == list_lanes(line)
+            assert len(list_driving_lanes(element, "right")) == list_lanes(line)
             counted += 1
     assert counted > 8
 
