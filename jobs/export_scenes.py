@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Export scenes for other programs, as meshes, voxels or OpenDRIVE roads.
+"""Export scenes for other programs, as meshes, voxels, OpenDRIVE roads or polygons.
 
     jobs/export_scenes.py --input DIR --formats glb xodr
     jobs/export_scenes.py --max-scenes 10 --formats ply npz --output DIR
@@ -7,8 +7,9 @@
 A GLB file (glTF 2.0) has one named node per primitive. The extras of the node contain class, instance and exact
 parameters. A PLY file has one mesh with a colour, class id and primitive number per vertex. An NPZ file has 256 x 256 x
 32 voxels with class ids. The jobs import_scenes and evaluate_voxels read such files. An XODR file describes the roads
-for simulators, as OpenDRIVE 1.7 with lanes, elevation and junctions. The job writes OUTPUT/<format>/<scene_id>.<format>
-and keeps existing files.
+for simulators, as OpenDRIVE 1.7 with lanes, elevation and junctions. A GEOJSON file has polygons of the ground and
+outlines of the primitives, seen from above. The job writes OUTPUT/<format>/<scene_id>.<format> and keeps existing
+files.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from jobs.support.options import IfBusyOption, LogFormatOption, SceneOptions
 
 @dataclass(frozen=True)
 class Config(SceneOptions):
-    formats: tuple[Literal["glb", "ply", "npz", "xodr"], ...] = ("glb",)
+    formats: tuple[Literal["glb", "ply", "npz", "xodr", "geojson"], ...] = ("glb",)
     """File formats to write."""
     output: str = ""
     """Directory to write to (default: export/ in the input directory)."""

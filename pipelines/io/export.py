@@ -1,4 +1,4 @@
-"""Export scenes as GLB, PLY, voxels or OpenDRIVE, with one Ray task per shard."""
+"""Export scenes as GLB, PLY, voxels, OpenDRIVE or GeoJSON, with one Ray task per shard."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 from models.scene import Scene
+from pipelines.io.geojson import export_geojson
 from pipelines.io.mesh_export import export_glb, export_ply
 from pipelines.io.opendrive import export_opendrive
 from pipelines.io.voxel_import import export_voxels_npz
@@ -15,12 +16,13 @@ from pipelines.schema.file_names import make_file_name
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, make_rejects_table
 
-Format = Literal["glb", "ply", "npz", "xodr"]
+Format = Literal["glb", "ply", "npz", "xodr", "geojson"]
 WRITERS: dict[str, Callable[[Scene], bytes]] = {
     "glb": export_glb,
     "ply": export_ply,
     "npz": export_voxels_npz,
     "xodr": export_opendrive,
+    "geojson": export_geojson,
 }
 
 

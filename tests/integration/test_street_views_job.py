@@ -54,8 +54,8 @@ def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluste
     with pytest.raises(ValueError, match=r"run 'drive' with spacing_m=8.0, asked for 2.0; choose another --run"):
         render(replace(options, spacing_m=2.0))
 
-    output, counts, refused = export(ExportConfig(str(tmp_path), formats=("glb", "ply", "npz", "xodr")))
-    assert counts == {"glb": 2, "ply": 2, "npz": 2, "xodr": 1}
+    output, counts, refused = export(ExportConfig(str(tmp_path), formats=("glb", "ply", "npz", "xodr", "geojson")))
+    assert counts == {"glb": 2, "ply": 2, "npz": 2, "xodr": 1, "geojson": 2}
     assert list(refused) == ["bare"] and refused["bare"].startswith("xodr: scene bare has no road")
     path = Path(output)
     mesh = trimesh.load(path / "ply" / f"{town_scenes[0].scene_id}.ply", process=False)
