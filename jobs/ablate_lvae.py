@@ -62,7 +62,7 @@ class Branches:
     """
 
     preset: tyro.conf.Positional[str] = "town"
-    """Preset: smoke, demo, town, kitti360, kitti360-mini, kitti360-light or av2."""
+    """Preset: smoke, demo, town, town-pixels, kitti360, kitti360-mini, kitti360-light or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     minutes: float = 10.0
@@ -96,7 +96,7 @@ class Decoders(Branches):
     """Compare the cell decoder with the paper's DETR decoder, with and without shortcuts, for equal training time."""
 
     preset: tyro.conf.Positional[str] = "demo"
-    """Preset: smoke, demo, town, kitti360, kitti360-mini, kitti360-light or av2."""
+    """Preset: smoke, demo, town, town-pixels, kitti360, kitti360-mini, kitti360-light or av2."""
     num_checkpoints: int = 12
     """Number of checkpoints per training run; the validation at each checkpoint gives one point of a curve."""
     name: str = "decoders"
@@ -126,6 +126,8 @@ class Detr(Branches):
 class Ground(Branches):
     """Compare sizes of the ground branch, from 1/100 of the paper's size to the full size, for equal training time."""
 
+    preset: tyro.conf.Positional[str] = "town-pixels"
+    """Preset: smoke, demo, town, town-pixels, kitti360, kitti360-mini, kitti360-light or av2."""
     num_checkpoints: int = 8
     """Number of checkpoints per training run; the validation at each checkpoint gives one point of a curve."""
     name: str = "ground"

@@ -31,7 +31,7 @@ class Config:
     """Options of a training run; options that are not given have the values of the preset (models/presets.py)."""
 
     preset: tyro.conf.Positional[str] = "town"
-    """Preset: smoke, demo, town, kitti360, kitti360-mini, kitti360-light or av2."""
+    """Preset: smoke, demo, town, town-pixels, kitti360, kitti360-mini, kitti360-light or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     name: str = ""

@@ -1,7 +1,8 @@
 """Presets: options of each model size, as one row of a table. All presets use the same code.
 
 * `smoke` trains within seconds, for tests.
-* `demo` and `town` train on two CPU cores; the layout VAE takes half an hour and the transformer three hours.
+* `demo` trains on two CPU cores; the layout VAE takes half an hour and the transformer three hours.
+* `town` has level sets and finer rasters. The layout VAE takes six hours on one CPU core and the transformer longer.
 * `kitti360` and `av2` are the paper's models (supplement B.2 and B.3). `kitti360-mini` rehearses them on two cores.
 """
 
@@ -72,7 +73,7 @@ DEMO = LayoutVAEConfig(16, GroundConfig((32, 64), 8, 4, attention=False), SMALL_
 TOWN = LayoutVAEConfig(
     16, GroundConfig((32, 64, 64), 8, 4, attention=False, level_sets=True), SMALL_CELLS, shortcut=True
 )
-LIGHT = LayoutVAEConfig(32, GroundConfig((32,), 8, 8, attention=False), PAPER_CELLS, shortcut=True)
+PIXELS = LayoutVAEConfig(32, GroundConfig((32,), 8, 8, attention=False), SMALL_CELLS, shortcut=True)
 MINI = LayoutVAEConfig(32, GroundConfig((8, 16, 32, 64), 4), ObjectConfig(128, 3, 4, 256, 256))
 
 # fmt: off
@@ -81,6 +82,8 @@ LVAE_PRESETS: dict[str, LVAEPreset] = {
     "smoke":    LVAEPreset("town",      32,  SMOKE, 4,     8,       learning_rate=1e-3, final_learning_rate=1e-4),
     "demo":     LVAEPreset("town",      128, DEMO,  8,     5_000,   latent_noise=0.3, **QUICK),
     "town":     LVAEPreset("town",      256, TOWN,  8,     20_000,  latent_noise=0.3, **QUICK),
+    # A ground with one logit per pixel, for the study of ground networks (docs/experiments/ground_networks.md).
+    "town-pixels": LVAEPreset("town",    256, PIXELS, 8,    2_000,   kl_weight=1e-7, **QUICK),
     # The paper reports three days of training on one A100 but not the number of steps.
     "kitti360": LVAEPreset("kitti360",  256, PAPER, 32,    300_000, init_from_data=False),
     "av2":      LVAEPreset("av2",       256, PAPER, 32,    300_000, init_from_data=False),
@@ -88,7 +91,8 @@ LVAE_PRESETS: dict[str, LVAEPreset] = {
     "kitti360-mini": LVAEPreset("kitti360", 256, MINI, 4, 6_000, learning_rate=5e-4),
     # This preset combines the paper's object encoder with a smaller ground branch and the cell decoder.
     # The latent has the same shape as in the paper, but training costs less.
-    "kitti360-light": LVAEPreset("kitti360", 256, LIGHT, 32, 300_000, **(QUICK | LOWER_RATE)),
+    "kitti360-light": LVAEPreset("kitti360", 256, replace(PIXELS, objects=PAPER_CELLS), 32, 300_000,
+                                 **(QUICK | LOWER_RATE)),
 }
 # fmt: on
 

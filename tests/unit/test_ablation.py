@@ -281,7 +281,7 @@ def test_layout_vae_config_without_switches_is_full_model():
 
 
 def test_ground_study_shrinks_networks_at_equal_latents():
-    row = LVAE_PRESETS["town"].architecture()
+    row = LVAE_PRESETS["town-pixels"].architecture()
     models = {
         name: LayoutVAE(layout=LayoutSpec().to_dict(), **override_options(row, variant.architecture))
         for name, variant in GROUND_VARIANTS.items()
