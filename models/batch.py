@@ -29,7 +29,7 @@ class LayoutBatch:
     occupied: Float[Tensor, "batch ground rows cols"]
     features: Float[Tensor, "batch slots 9"]
     real: Bool[Tensor, "batch slots"]
-    _distances_px: dict[int, Tensor] = field(default_factory=dict, repr=False)
+    _distances_px: dict[int, Tensor] = field(default_factory=dict, repr=False, init=False)
 
     def __len__(self) -> int:
         return len(self.real)

@@ -154,8 +154,10 @@ class LayoutVAE(ConfiguredModel):
         """
         channels = self.config.latent_channels
         if self.ground_encoder and self.ground_decoder:
-            init = init_level_sets if isinstance(self.ground_decoder, LevelSetDecoder) else init_from_data
-            init(self.ground_encoder, self.ground_decoder, batch.height, batch.occupied)
+            if isinstance(self.ground_decoder, LevelSetDecoder):
+                init_level_sets(self.ground_encoder, self.ground_decoder, batch.height, batch.occupied)
+            else:
+                init_from_data(self.ground_encoder, self.ground_decoder, batch.height, batch.occupied)
             bias = cast(Tensor, self.ground_encoder.net.conv_out.bias)
             bias[channels:] = SOLVED_LOGVAR if self.config.shortcut else INITIAL_LOGVAR
         if not (self.object_encoder and self.object_decoder):

@@ -325,7 +325,7 @@ DETR_VARIANTS = {
     name: Variant({"branches": "objects"} | dict(change.architecture), change.options)
     for name, change in _DETR_CHANGES.items()
 }
-# Variants with only the ground branch. The preset `town-pixels` has the options `pixel_unshuffle=8` and `channels=(32,)`.
+# Variants with only the ground branch. The preset `town-pixels` has `pixel_unshuffle=8` and `channels=(32,)`.
 # With the option `shortcut`, the initial weights are a linear map from a principal component analysis of the data
 # (models/vae/ground.py).
 GROUND_VARIANTS = {

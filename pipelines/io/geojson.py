@@ -72,4 +72,4 @@ def list_outlines(scene: Scene) -> list[shapely.Geometry]:
 
 def _make_feature(shape: shapely.Geometry, **properties: object) -> dict:
     rounded = shapely.transform(shape, lambda points: np.round(points, DECIMALS))
-    return {"type": "Feature", "geometry": shapely.geometry.mapping(rounded), "properties": properties}
+    return {"type": "Feature", "geometry": json.loads(shapely.to_geojson(rounded)), "properties": properties}

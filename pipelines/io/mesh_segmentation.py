@@ -305,7 +305,7 @@ def find_pixel_centers(vertices_m: np.ndarray, grid: Grid) -> np.ndarray:
     inside = (at_px >= -ON_GRID_PX) & (at_px <= np.array([grid.rows, grid.cols]) + ON_GRID_PX)
     if not (len(inside) and inside.all()):
         return np.ones(len(vertices_m), bool)
-    found = (np.abs(at_px - 0.5 - np.round(at_px - 0.5)) <= ON_GRID_PX).all(axis=1)
+    found = np.all(np.abs(at_px - 0.5 - np.round(at_px - 0.5)) <= ON_GRID_PX, axis=1)
     return found if found.mean() >= MIN_CENTERS else np.ones(len(vertices_m), bool)
 
 

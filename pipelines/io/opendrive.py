@@ -173,12 +173,11 @@ def _measure_reach(start: np.ndarray, direction: np.ndarray, area: shapely.Geome
     The distance is 0 for points outside the area, and at most `most_m`.
     """
     rays = shapely.linestrings(np.stack([start, start + most_m * direction], axis=1))
-    inside = shapely.intersection(rays, area)
-    first = [
-        next((p for p in shapely.get_parts(s) if p.distance(shapely.Point(a)) < 1e-6), None)
-        for s, a in zip(inside, start, strict=True)
-    ]
-    return np.array([0.0 if part is None else part.length for part in first])
+    parts, ray = shapely.get_parts(shapely.intersection(rays, np.array(area)), return_index=True)
+    at_start = shapely.distance(parts, shapely.points(start[ray])) < 1e-6
+    reach = np.zeros(len(start))
+    reach[ray[at_start]] = shapely.length(parts[at_start])
+    return reach
 
 
 def list_lanes(line: ReferenceLine) -> int:

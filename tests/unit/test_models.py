@@ -61,7 +61,9 @@ def test_presets_have_parameter_counts_of_paper():
 
 
 def test_presets_error_lists_known_names():
-    with pytest.raises(ValueError, match="unknown preset 'tiny', expected one of: smoke, demo, town, kitti360, av2"):
+    with pytest.raises(
+        ValueError, match="unknown preset 'tiny', expected one of: smoke, demo, town, town-pixels, kitti360, av2"
+    ):
         find_preset(LVAE_PRESETS, "tiny")
 
 
