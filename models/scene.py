@@ -241,6 +241,7 @@ class Scene:
         world_from_imu: (3, 4) full pose from the source; None: unknown.
         vegetation_density: Density label of the vegetation; None: unknown.
         vehicle_density: Density label of the vehicles; None: unknown.
+        free_pose: Whether the scene is a crop at any place and heading; False for a view of a vehicle.
     """
 
     scene_id: str
@@ -265,6 +266,7 @@ class Scene:
     world_from_imu: np.ndarray | None = None
     vegetation_density: str | None = None
     vehicle_density: str | None = None
+    free_pose: bool = False
 
     def __post_init__(self) -> None:
         n = len(self.category)

@@ -35,6 +35,7 @@ NUM_THREADS = 16  # Threads that read footers.
 MISSING = "no such file"  # End of the description of a missing file.
 TEMPORARY = ".tmp-"
 ABANDONED_S = 3600.0  # A temporary file of another machine is abandoned after this time without a change (s).
+DEFAULT = b"default"  # Metadata of a field: value (JSON) of a column that earlier versions did not write.
 # A text column that can exceed this size (bytes) is read with dictionary encoding until its total length is known.
 TEXT_BYTES = 2**28
 
@@ -278,7 +279,9 @@ def _read_checked(stream: Any, columns: list[str] | None, schema: pa.Schema | No
     metadata = pq.read_metadata(stream)
     found = metadata.schema.to_arrow_schema()
     wanted = columns if columns is not None else schema.names if schema is not None else found.names
-    for name in wanted:
+    defaults = _find_defaults(wanted, found, schema)
+    stored = [name for name in wanted if name not in defaults]
+    for name in stored:
         kind = found.field(name).type if len(found.get_all_field_indices(name)) == 1 else None
         if kind is None or (schema is not None and kind != schema.field(name).type):
             expected = "" if schema is None else f" or not of type {schema.field(name).type}"
@@ -286,13 +289,23 @@ def _read_checked(stream: Any, columns: list[str] | None, schema: pa.Schema | No
                 f"column {name!r} is missing or occurs twice{expected}; run the job that writes the table again with"
                 " this version"
             )
-    num_rows, texts = _check_sizes(stream, found, wanted)
+    num_rows, texts = _check_sizes(stream, found, stored)
     options: Any = {"read_dictionary": [*texts, *encoded], "page_checksum_verification": True}
     with pq.ParquetFile(stream, metadata=metadata, **options) as file:
-        table = file.read(columns=wanted).select(wanted)
+        table = file.read(columns=stored).select(stored)
     if len(table) != num_rows:
         raise pa.ArrowInvalid(f"{len(table)} rows can be read, but the file states {num_rows}")
-    return _decode_texts(table, encoded)
+    table = _decode_texts(table, encoded)
+    for name, value in defaults.items():
+        kind = schema.field(name).type if schema is not None else None
+        table = table.append_column(name, pa.array([value] * num_rows, kind))
+    return table.select(wanted) if defaults else table
+
+
+def _find_defaults(wanted: Sequence[str], found: pa.Schema, schema: pa.Schema | None) -> dict[str, Any]:
+    """Return the values of columns that a file of an earlier version lacks, and whose field states a default."""
+    absent = [schema.field(name) for name in wanted if name not in found.names] if schema is not None else []
+    return {field.name: json.loads(field.metadata[DEFAULT]) for field in absent if DEFAULT in (field.metadata or {})}
 
 
 def _check_sizes(stream: Any, schema: pa.Schema, columns: Sequence[str]) -> tuple[int, list[str]]:

@@ -31,6 +31,7 @@ TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
 SCENE_TABLES = ("scenes", "primitives", "rasters")  # Tables that every shard has.
 TEXTS = ("scene_id", "category", "label", "kind")  # Text columns of the table `primitives`.
 SCHEMA_VERSION = "1"  # Version of the column names and types. Descriptions may change within a version.
+DEFAULTS = {"free_pose": "false"}  # JSON value of columns that earlier versions did not write.
 HEIGHT_STEP_M = 0.01
 MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # Largest height (m) that a 16-bit integer can store.
 
@@ -64,11 +65,15 @@ def _make_schema(description: str, *columns: tuple[str, pa.DataType, str, str]) 
     """Make a self-describing schema from rows of (name, type, unit, description); the unit "" means dimensionless.
 
     Every field has the metadata `unit` and `description`. DuckDB does not show field metadata. The metadata of the
-    table therefore repeats the rows as JSON under `pritti_columns`.
+    table therefore repeats the rows as JSON under `pritti_columns`. DEFAULTS gives the value of columns that earlier
+    versions did not write.
     """
     fields, rows = [], []
     for name, kind, unit, meaning in columns:
-        fields.append(pa.field(name, kind, metadata={"description": meaning} | ({"unit": unit} if unit else {})))
+        about = {"description": meaning} | ({"unit": unit} if unit else {})
+        if name in DEFAULTS:
+            about[storage.DEFAULT.decode()] = DEFAULTS[name]
+        fields.append(pa.field(name, kind, metadata=about))
         rows.append({"name": name, "unit": unit or None, "description": meaning})
     metadata = {
         "pritti_schema_version": SCHEMA_VERSION,
@@ -108,6 +113,9 @@ SCENES = _make_schema(
     ("world_from_imu",       pa.list_(pa.float64()), "1; m",
      "Full pose in the source dataset, a 3 x 4 matrix row by row with the translation (m) in its last column; or "
      "null."),
+    ("free_pose",            pa.bool_(),   "",
+     "Whether the scene is a crop at any place and heading (town of version 2); false for the view of a vehicle and "
+     "in files of earlier versions."),
     ("vegetation_density",   pa.string(),  "",
      "low, medium or high, by number and volume of vegetation; for generated scenes, the requested label or null."),
     ("vehicle_density",      pa.string(),  "",
@@ -299,6 +307,7 @@ def _make_scenes_table(scenes: Sequence[Scene]) -> pa.Table:
         "z_m": [s.world_xyz_m[2] for s in scenes],
         "yaw_rad": [s.world_yaw_rad for s in scenes],
         "world_from_imu": [None if s.world_from_imu is None else s.world_from_imu.ravel().tolist() for s in scenes],
+        "free_pose": [s.free_pose for s in scenes],
         "vegetation_density": [s.vegetation_density for s in scenes],
         "vehicle_density": [s.vehicle_density for s in scenes],
         "vegetation_volume_m3": volume(VEGETATION),
@@ -435,6 +444,7 @@ def parse_scenes(
             world_xyz_m=(scene["x_m"], scene["y_m"], scene["z_m"]),
             world_yaw_rad=scene["yaw_rad"],
             world_from_imu=None if pose is None else np.array(pose).reshape(3, 4),
+            free_pose=scene["free_pose"],
             vegetation_density=scene["vegetation_density"],
             vehicle_density=scene["vehicle_density"],
             **{name: value[here] for name, value in fields.items()},

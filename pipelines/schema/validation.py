@@ -196,6 +196,7 @@ RULES: Mapping[str, Mapping[str, Callable[[pa.Table, str], None]]] = {
         "frame": _require_present,
         **dict.fromkeys(("x_m", "y_m", "z_m", "yaw_rad"), _FINITE),
         "world_from_imu": _validate_poses,
+        "free_pose": _require_present,
         **dict.fromkeys(("vegetation_density", "vehicle_density"), _make_choice_rule(DENSITIES, is_optional=True)),
         **dict.fromkeys(("vegetation_volume_m3", "vehicle_volume_m3"), _COUNT),
         **dict.fromkeys(("num_primitives", *(f"num_{name}" for name in CATEGORIES), "primitive_offset"), _COUNT),

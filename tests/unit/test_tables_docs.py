@@ -406,7 +406,7 @@ def assert_columns_are_described(path: str, schema: pa.Schema):
     assert written.names == schema.names
     for field in written:
         stored = {k.decode(): v.decode() for k, v in field.metadata.items() if not k.startswith(b"PARQUET:")}
-        assert stored.pop("description").endswith(".") and set(stored) <= {"unit"}, field.name
+        assert stored.pop("description").endswith(".") and set(stored) <= {"unit", "default"}, field.name
         assert stored.get("unit", "").encode() == schema.field(field.name).metadata.get(b"unit", b"")
     pairs = duckdb.sql(
         f"select decode(key), decode(value) from parquet_kv_metadata('{path}') where key <> 'ARROW:schema'"

@@ -335,6 +335,7 @@ class Drive:
         timestamp: Frame in which a moving box has this position; STATIC for static boxes.
         frame: Frame number of each pose.
         world_from_imu: Pose matrices of the IMU, whose x axis points forward.
+        free_pose: Whether a pose lies at any place and heading instead of being that of a vehicle (default: False).
     """
 
     source: str
@@ -351,6 +352,7 @@ class Drive:
     ground: SlabGround | MapGround | SurfaceGround
     frame: np.ndarray  # (p,) int64
     world_from_imu: np.ndarray  # (p, 3, 4)
+    free_pose: np.ndarray | None = None  # (p,) bool
 
     def __len__(self) -> int:
         """Return the number of poses."""
@@ -380,6 +382,7 @@ class Drive:
             ground=self.ground.near(low_m, high_m),
             frame=self.frame[poses],
             world_from_imu=self.world_from_imu[poses],
+            free_pose=None if self.free_pose is None else self.free_pose[poses],
         )
 
     def pose(self, index: int) -> Pose:
@@ -445,4 +448,5 @@ class Drive:
             world_xyz_m=(x_m, y_m, z_m),
             world_yaw_rad=pose.yaw_rad,
             world_from_imu=self.world_from_imu[index],
+            free_pose=self.free_pose is not None and bool(self.free_pose[index]),
         )
