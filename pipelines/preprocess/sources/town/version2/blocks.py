@@ -253,11 +253,11 @@ def _add_sign(site: Site, frame: LocalFrame, s: float, t: float) -> None:
     pole = draw_sizes(rng, "bigPole" if tall else "smallPole", 1, (1.0, 1.0, 0.8) if tall else (1.0, 1.0, 1.2))[0]
     pole[2] = max(2.0, pole[2])
     site.sheet.boxes(frame, "bigPole" if tall else "smallPole", s, t, pole)
-    top = pole[2] + 0.8
+    bottom = pole[2] - 0.1
     for _ in range(1 + (rng.random() < 0.2)):  # The second sign is below the first one.
         sign = draw_sizes(rng, "trafficSign", 1)[0]
-        site.sheet.boxes(frame, "trafficSign", s, t, sign, np.pi / 2, top - sign[2])
-        top -= sign[2] + 0.05
+        site.sheet.boxes(frame, "trafficSign", s, t, sign, np.pi / 2, bottom)
+        bottom -= sign[2] + 0.05
 
 
 def _add_lights(site: Site, frame: LocalFrame, s: float, t: float) -> None:

@@ -157,8 +157,8 @@ def _build_plot(site: Site, frame: LocalFrame, row: Row, plot: Plot) -> None:
         room = plot.width - plot.front - plot.drive - plot.left if mirrored is False else plot.left
         wide = min(room, float(rng.uniform(1.5, 3.5)))
         side = (walls[1], walls[1] + wide) if not mirrored else (walls[0] - wide, walls[0])
-        painted.append((GROUND, (*side, 0.0, setback + 0.8 * across)))
-        taken.append((*side, 0.0, setback + 0.8 * across))
+        painted.append((GROUND, (*side, 0.0, setback + across)))
+        taken.append((*side, 0.0, setback + across))
     if plot.drive > 2.2:
         strip = (plot.left, plot.left + plot.drive) if not mirrored else (walls[1], walls[1] + plot.drive)
         drive = _build_drive(site, frame, row, walls, strip)
@@ -210,7 +210,7 @@ def _add_building(site: Site, frame: LocalFrame, label: str, walls: Rect, height
 def _build_drive(site: Site, frame: LocalFrame, row: Row, walls: Rect, strip: tuple[float, float]) -> Rect:
     """Build a drive beside a house, with a garage at its end, a car and low walls. Return the drive."""
     rng, width = site.rng, strip[1] - strip[0]
-    end = float(np.clip(walls[2] + rng.uniform(0.5, 7.0), 4.8, max(4.8, row.depth - 6.0)))
+    end = float(np.clip(walls[2] + rng.uniform(1.0, 9.0), 4.8, max(4.8, row.depth - 6.0)))
     if rng.random() < site.district.garages and row.depth - end > 5.0:
         size = draw_sizes(rng, "garage", 1)[0]
         deep = min(float(size[0]), row.depth - end - 0.2)
