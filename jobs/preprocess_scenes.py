@@ -36,6 +36,11 @@ class Town:
     """Number of test scenes, which come from separate towns."""
     seed: int = 0
     """Random seed."""
+    town_version: Literal[1, 2] = 1
+    """Version of the town. Version 2 is nearer to real streets (docs/experiments/town2.md)."""
+    free_pose_share: float | None = None
+    """Share of the scenes that are crops at any place and heading, instead of views of a vehicle (default: 0.25 for
+    version 2, 0 for version 1)."""
     slots: Literal["p95", "paper"] = "p95"
     """Rule for the number of slots per category: the 95th percentile over the training split, or the paper's 514 slots
     in total."""

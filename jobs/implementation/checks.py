@@ -119,6 +119,14 @@ def check_encode_latents(config: EncodeConfig) -> None:
 
 
 def check_preprocess_scenes(config: Town | Kitti360 | Av2 | Own) -> None:
+    if isinstance(config, Town) and config.free_pose_share is not None:
+        if not 0 <= config.free_pose_share <= 1:
+            raise ValueError(f"--free-pose-share is {config.free_pose_share}, expected a share between 0 and 1")
+        if config.free_pose_share and config.town_version == 1:
+            raise ValueError(
+                f"--free-pose-share is {config.free_pose_share}, but town version 1 has no free poses; "
+                "add --town-version 2"
+            )
     if not isinstance(config, Town) and not storage.exists(make_absolute(config.input)):
         raise ValueError(f"--input {config.input}: no such directory; specify the root directory of the dataset")
 

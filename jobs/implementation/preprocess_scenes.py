@@ -14,16 +14,23 @@ from jobs.support.progress import JobProgress
 from models.layout import PAPER_SLOTS
 from pipelines.preprocess import sharding
 from pipelines.preprocess.ingest import ingest_drives
-from pipelines.preprocess.sources.town.generator import TOWN_VERSION
 
 NOT_RECORDED = ("output", "skip_unreadable", "if_busy", "log_format")
+FREE_POSE_SHARE = 0.25  # Default for version 2 of the town.
 RECORDED_AS = {"make_split": "split"}  # keys in dataset.json
+
+
+def find_free_pose_share(config: Town) -> float:
+    """Return the share of free poses, or its default for the version of the town."""
+    default = FREE_POSE_SHARE if config.town_version > 1 else 0.0
+    return default if config.free_pose_share is None else config.free_pose_share
 
 
 def plan_shards(config: Town | Kitti360 | Av2 | Own) -> list:
     """Return the shards to write."""
     if isinstance(config, Town):
-        return sharding.plan_town(config.num_train, config.num_test, config.seed)
+        share = find_free_pose_share(config)
+        return sharding.plan_town(config.num_train, config.num_test, config.seed, config.town_version, share)
     root = make_absolute(config.input)
     if isinstance(config, Av2):
         return sharding.plan_argoverse2(root)
@@ -36,7 +43,9 @@ def make_recorded_options(config: Town | Kitti360 | Av2 | Own) -> dict:
     options = {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED}
     options["source"] = type(config).__name__.lower()
     if isinstance(config, Town):
-        return options | {"town_version": TOWN_VERSION}
+        # Datasets of version 1 do not record the share, as in earlier versions of this job.
+        share = {"free_pose_share": find_free_pose_share(config)} if config.town_version > 1 else {}
+        return {name: value for name, value in options.items() if name != "free_pose_share"} | share
     return options | {"input": make_absolute(config.input)}
 
 

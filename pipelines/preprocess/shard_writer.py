@@ -44,9 +44,9 @@ def read_drive(source: str, key: tuple) -> tuple[Drive, dict]:
         ValueError: A file cannot be read; the message names the file.
     """
     if source == "town":
-        seed, num_scenes = key
-        drive = generator.generate_town(seed)
-        return drive.at(generator.select_poses(len(drive), num_scenes)), {}
+        seed, num_scenes, version, num_free = key
+        drive = generator.generate_town(seed, version, num_free)
+        return drive.at(generator.select_town_poses(len(drive), num_scenes, num_free)), {}
     if source == "kitti360":
         drive, report = kitti360.read_drive(*key)
         return drive, asdict(report)

@@ -57,21 +57,28 @@ class ShardTask:
         return Shard(root, self.source, self.split, self.number)
 
 
-def plan_town(num_train: int, num_test: int, seed: int) -> list[ShardTask]:
+def plan_town(
+    num_train: int, num_test: int, seed: int, version: int = generator.TOWN_VERSION, free_pose_share: float = 0.0
+) -> list[ShardTask]:
     """Plan one task per town.
 
     Args:
         num_train: Number of training scenes.
         num_test: Number of test scenes.
         seed: Seed that selects the towns.
+        version: Version of the town.
+        free_pose_share: Share of the scenes of each split that are crops at any place and heading.
 
     Returns:
         The tasks.
     """
-    plan = [
-        (split, ShardPart((town_seed, count), f"{town_seed:05d}"))
-        for town_seed, split, count in generator.plan_town_parts(num_train, num_test, seed)
-    ]
+    parts = generator.plan_town_parts(num_train, num_test, seed)
+    plan, done = [], dict.fromkeys((TRAIN, TEST), 0)
+    for town_seed, split, count in parts:
+        # Rounding the cumulative number makes the share exact in each split.
+        num_free = round((done[split] + count) * free_pose_share) - round(done[split] * free_pose_share)
+        done[split] += count
+        plan.append((split, ShardPart((town_seed, count, version, num_free), f"{town_seed:05d}")))
     return _number_tasks("town", [(split, (part,)) for split, part in plan])
 
 

@@ -63,12 +63,12 @@ def draw_sizes(
 
 
 def plant_strip(
-    site: Site, frame: LocalFrame, ground_class: str, start: float, end: float, t0: float, t1: float, piece: float
+    sheet: Sheet, frame: LocalFrame, ground_class: str, start: float, end: float, t0: float, t1: float, piece: float
 ) -> None:
     """Add adjacent slabs from s = start to s = end, each about `piece` metres long."""
     cuts = np.linspace(start, end, max(1, round((end - start) / piece)) + 1).tolist()
     for a, b in pairwise(cuts):
-        site.sheet.slab(frame, ground_class, [(a, t0), (b, t0), (b, t1), (a, t1)])
+        sheet.slab(frame, ground_class, [(a, t0), (b, t0), (b, t1), (a, t1)])
 
 
 def place_cars(site: Site, frame: LocalFrame, s: np.ndarray, t: float, yaw: float = np.pi) -> None:

@@ -89,18 +89,18 @@ def _build_side(site: Site, block: CityBlock, k: int, depths: list) -> None:
     if r0:
         corner_class = "sidewalk" if sidewalk or before[1] else "terrain"
         start = max(r0, depth, before[0]) + 0.5
-        _build_corner(site, frame, r0, start, depth, before[0], corner_class)
+        build_corner(site, frame, r0, start, depth, before[0], corner_class)
     if r1:
         end = length - max(r1, depth, after[0]) - 0.5
     if bay:
         _place_bays(site, frame, start, end, paved)
-    plant_strip(site, frame, paved, start, end, BAY_DEPTH_M * bay, depth, 9.0 if sidewalk else 18.0)
+    plant_strip(site.sheet, frame, paved, start, end, BAY_DEPTH_M * bay, depth, 9.0 if sidewalk else 18.0)
     if not bay:
         _place_curb_cars(site, frame, start + 3, end - 3)
     _place_furniture(site, frame, start, end, depth, bool(r0))
 
 
-def _build_corner(
+def build_corner(
     site: Site, frame: LocalFrame, r: float, size: float, depth: float, depth_before: float, ground_class: str
 ) -> None:
     """Build the sidewalk around a kerb of radius r. `size` is the extent of the sidewalk along both streets."""
@@ -241,7 +241,7 @@ def _build_meadow(site: Site, block: CityBlock) -> None:
     )
     if site.rng.random() < site.district.terrain_back:
         for a in (0.0, width / 2):
-            plant_strip(site, frame, "terrain", 0.0, depth, a, a + width / 2, 20.0)
+            plant_strip(site.sheet, frame, "terrain", 0.0, depth, a, a + width / 2, 20.0)
     plant_garden(site, frame, width, depth, [])
 
 
@@ -258,13 +258,13 @@ def _build_garage_court(site: Site, interior: tuple[LocalFrame, float, float]) -
         here = at[site.rng.random(n) < 0.92]
         size = np.exp(0.02 * site.rng.standard_normal((len(here), 3))) * g
         site.sheet.boxes(frame, "garage", here, low + g[0] / 2, size, np.pi / 2, -0.1)
-    plant_strip(site, frame, "parking", 0.0, end, margin + g[0], margin + g[0] + aisle, end / 2)
+    plant_strip(site.sheet, frame, "parking", 0.0, end, margin + g[0], margin + g[0] + aisle, end / 2)
     here = at[site.rng.random(n) < 0.25 * site.mood.cars]
     place_cars(site, frame, here, margin + g[0] + 2.7, np.pi / 2)
     for low in (0.0, depth - margin):
         edge = frame.at(0.0, low)
         if margin > 1 and site.rng.random() < site.district.terrain_front:
-            plant_strip(site, frame, "terrain", 0.0, width, low, low + margin, 25.0)
+            plant_strip(site.sheet, frame, "terrain", 0.0, width, low, low + margin, 25.0)
         if margin > 1.5:
             plant_garden(site, edge, width, margin, [])
         plant_border(

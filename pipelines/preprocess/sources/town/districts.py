@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+# Main district and edge district of a town; the index is the seed modulo 4. Four successive seeds give all four pairs.
+TOWN_KINDS = (("suburb", "green"), ("centre", "suburb"), ("green", "suburb"), ("suburb", "centre"))
+
 
 @dataclass(frozen=True)
 class District:

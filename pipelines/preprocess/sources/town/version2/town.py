@@ -1,0 +1,209 @@
+"""Make a town of version 2: streets of several widths, rows of houses, and crops at any place and heading.
+
+Compared with version 1, houses stand on building lines on all sides of a block, most objects stand near the street, and
+the annotated ground ends behind the houses. Buildings overlap neither streets nor each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES
+from pipelines.preprocess.sources.drive import Drive, SlabGround
+from pipelines.preprocess.sources.town.districts import TOWN_KINDS
+from pipelines.preprocess.sources.town.land import Land, Sheet, draw_land
+from pipelines.preprocess.sources.town.streets import (
+    CityBlock,
+    Streets,
+    lay_streets,
+    list_blocks,
+    pave_streets,
+    plan_route,
+)
+from pipelines.preprocess.sources.town.version2.assets import Site
+from pipelines.preprocess.sources.town.version2.blocks import furnish_block
+from pipelines.preprocess.sources.town.version2.districts import DISTRICTS, Variation, draw_variation
+from pipelines.preprocess.sources.town.version2.footprints import compute_corners, find_covered, separate_buildings
+from pipelines.preprocess.sources.town.world import (
+    IMU_HEIGHT_M,
+    METRES_PER_FRAME,
+    collect_boxes,
+    collect_ground,
+    make_poses,
+    measure_travel,
+    place_traffic,
+    sample_poses,
+)
+
+SPACING_M = {"centre": (48, 66), "suburb": (48, 66), "green": (58, 90)}
+OUTSKIRTS_M = 48.0
+MISSING = 0.2  # Share of inner streets that are omitted. Their ends become T-junctions.
+# Share and range of the half width of each class of streets.
+STREET_CLASSES = (("residential", 0.54, (2.35, 2.85)), ("collector", 0.32, (3.0, 3.7)), ("main", 0.14, (4.0, 5.0)))
+CORNER_M = (3.5, 7.5)  # Radius of kerbs.
+SKEWED = 0.5  # Share of towns whose streets do not cross at right angles.
+MAX_SKEW = 0.28  # Largest tangent of the deviation from a right angle.
+SKEW_WAVE_M = 4000.0
+SUNK_M = 0.1  # Depth of a building below the lowest point of the surface under its walls.
+FREE_CROP_M = 64.0  # Side of the crop ahead of a free pose.
+FREE_MARGIN_M = 14.0  # Largest distance of the corners of a free crop from the outermost streets.
+MAX_TRIES = 10_000
+STREET_CLASS = [KITTI_GROUND_CLASSES.index(name) for name in ("road", "sidewalk")]
+FREE_FRAMES_START = 1_000_000  # Frame number of the first free pose.
+
+
+def make_town(seed: int, num_free_poses: int = 0) -> Drive:
+    """Make one town, and one drive through its streets with up to 256 poses.
+
+    Args:
+        seed: Seed of the town. Seed modulo 4 determines the districts.
+        num_free_poses: Number of poses at any place and heading. They follow the poses of the vehicle.
+
+    Returns:
+        The drive.
+    """
+    rng = np.random.default_rng([7302, seed])
+    main, edge = TOWN_KINDS[seed % len(TOWN_KINDS)]
+    land = _skew_land(rng, draw_land(rng))
+    columns, rows = (4, 5) if main != "green" else (4, 4)
+    split = 3 if rng.random() < 0.5 else columns - 1
+    spacing_u = [rng.uniform(*SPACING_M[main if i < split else edge]) for i in range(columns)]
+    spacing_v = [rng.uniform(*SPACING_M[main]) for _ in range(rows)]
+    streets, cells = lay_streets(rng, spacing_u, spacing_v, MISSING)
+    streets = _widen_streets(rng, streets)
+    border = streets.u_m[split]
+
+    sheet = Sheet()
+    pave_streets(streets, sheet)
+    of_town = np.exp(rng.normal(0, [0.0, 0.08, 0.08, 0.08, 0.04, 0.08, 0.1, 0.1, 0.1, 0.15, 0.15]))
+    for block in list_blocks(streets, cells, lambda u, v: main if u < border else edge, OUTSKIRTS_M):
+        variation = Variation(*(np.array(list(vars(draw_variation(rng)).values())) * of_town).tolist())
+        furnish_block(Site(sheet, rng, DISTRICTS[block.kind], variation), block, _find_half_widths(streets, block))
+
+    route = plan_route(rng, streets)
+    at = sample_poses(rng, route, land)
+    frame = np.round(measure_travel(route, land)[at] / METRES_PER_FRAME).astype(np.int64)
+    place_traffic(sheet, rng, route, at, frame)
+    ground = collect_ground(sheet, land)
+    boxes = _settle_boxes(collect_boxes(sheet, rng, land), ground, land)
+    free = _draw_free_poses(np.random.default_rng([7303, seed]), streets, land, num_free_poses)
+    return Drive(
+        source="town",
+        sequence=f"{seed:05d}",
+        **boxes,
+        ground_classes=KITTI_GROUND_CLASSES,
+        ground=ground,
+        frame=np.concatenate([frame, FREE_FRAMES_START + np.arange(len(free))]),
+        world_from_imu=np.concatenate([make_poses(rng, route, at, land), free]),
+        free_pose=np.arange(len(frame) + len(free)) >= len(frame),
+    )
+
+
+# ---------------------------------------------------------------- streets
+
+
+def _skew_land(rng: np.random.Generator, land: Land) -> Land:
+    """Turn the u-streets of some towns, so that junctions have no right angles."""
+    skew = rng.uniform(-MAX_SKEW, MAX_SKEW) * (rng.random() < SKEWED)
+    wave = 2 * np.pi / SKEW_WAVE_M
+    return replace(land, bend_u=np.vstack([land.bend_u * [0.8, 1, 1], [skew / wave, wave, 0.0]]))
+
+
+def _widen_streets(rng: np.random.Generator, streets: Streets) -> Streets:
+    """Sample the class and the width of each street, and the radii of the kerbs."""
+    names = np.arange(len(STREET_CLASSES))
+
+    def draw(count: int) -> np.ndarray:
+        drawn = rng.choice(names, count, p=[share for _, share, _ in STREET_CLASSES])
+        return np.array([rng.uniform(*STREET_CLASSES[k][2]) for k in drawn])
+
+    corner = {node: float(rng.uniform(*CORNER_M)) for node in streets.corner_m}
+    return replace(streets, half_u_m=draw(len(streets.u_m)), half_v_m=draw(len(streets.v_m)), corner_m=corner)
+
+
+def _find_half_widths(streets: Streets, block: CityBlock) -> tuple[float, float, float, float]:
+    """Return the half widths of the streets at the sides south, east, north and west of a block."""
+    sides = (
+        (streets.v_m + streets.half_v_m, streets.half_v_m, block.v0),
+        (streets.u_m - streets.half_u_m, streets.half_u_m, block.u1),
+        (streets.v_m - streets.half_v_m, streets.half_v_m, block.v1),
+        (streets.u_m + streets.half_u_m, streets.half_u_m, block.u0),
+    )
+    south, east, north, west = (float(half[np.abs(edge - place).argmin()]) for edge, half, place in sides)
+    return south, east, north, west
+
+
+# ---------------------------------------------------------------- boxes in the world
+
+
+def _list_street_triangles(ground: SlabGround) -> np.ndarray:
+    """Return the tops of roads and sidewalks as triangles (t, 3, 2)."""
+    slab = ground.vertex_slab[ground.triangles[:, 0]]
+    corners = np.bincount(ground.vertex_slab, minlength=len(ground.slab_class)) // 2
+    start = np.searchsorted(slab, np.arange(len(ground.slab_class)))
+    is_top = np.arange(len(slab)) - start[slab] < corners[slab] - 2
+    return ground.vertices_m[ground.triangles[is_top & np.isin(ground.slab_class[slab], STREET_CLASS)], :2]
+
+
+def _settle_boxes(boxes: dict[str, np.ndarray], ground: SlabGround, land: Land) -> dict[str, np.ndarray]:
+    """Separate the buildings, let them stand on the surface, and remove objects inside buildings."""
+    center, size = boxes["center_m"].copy(), boxes["size_m"].copy()
+    built = np.flatnonzero(boxes["category"] == CATEGORY_INDEX["construction_big"])
+    axis = boxes["rotation"][built, :2, 0]
+    axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    center[built, :2], size[built, :2], kept = separate_buildings(
+        center[built, :2], axis, size[built, :2], _list_street_triangles(ground)
+    )
+    # A building stands on the lowest point of the surface under its corners.
+    corners = compute_corners(center[built, :2], axis, size[built, :2])
+    center[built, 2] = land.surface_m(corners).min(axis=1) - SUNK_M + size[built, 2] / 2
+    keep = np.ones(len(center), bool)
+    keep[built[~kept]] = False
+    standing = built[kept]
+    loose = np.flatnonzero(boxes["category"] != CATEGORY_INDEX["construction_big"])
+    keep[loose[find_covered(center[loose, :2], center[standing, :2], axis[kept], size[standing, :2])]] = False
+    boxes = boxes | {"center_m": center, "size_m": size}
+    return {name: values[keep] for name, values in boxes.items()}
+
+
+# ---------------------------------------------------------------- free poses
+
+
+def invert_land(land: Land, xy_m: np.ndarray) -> np.ndarray:
+    """Return the board points (..., 2) of world points."""
+    cos, sin = np.cos(land.yaw_rad), np.sin(land.yaw_rad)
+    bent = (xy_m - land.origin_m[:2]) @ np.array([[cos, -sin], [sin, cos]])
+
+    def wave(waves: np.ndarray, at: np.ndarray) -> np.ndarray:
+        return (waves[:, 0] * np.sin(at[..., None] * waves[:, 1] + waves[:, 2])).sum(axis=-1)
+
+    v = bent[..., 1] - wave(land.bend_v, bent[..., 0])
+    return np.stack([bent[..., 0] - wave(land.bend_u, v), v], axis=-1)
+
+
+def _draw_free_poses(rng: np.random.Generator, streets: Streets, land: Land, count: int) -> np.ndarray:
+    """Return poses (count, 3, 4) whose crops lie in the built area at any place and heading.
+
+    The first poses do not depend on `count`.
+    """
+    low = np.array([streets.u_m[0], streets.v_m[0]]) - FREE_MARGIN_M
+    high = np.array([streets.u_m[-1], streets.v_m[-1]]) + FREE_MARGIN_M
+    poses = np.empty((count, 3, 4))
+    square = np.array([[0, 1], [1, 1], [1, -1], [0, -1]]) * [FREE_CROP_M, FREE_CROP_M / 2]
+    found = 0
+    for _ in range(MAX_TRIES):
+        if found == count:
+            return poses
+        middle, yaw = land.xy(rng.uniform(low, high)), rng.uniform(-np.pi, np.pi)
+        forward, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+        origin = middle - forward * FREE_CROP_M / 2
+        corners = invert_land(land, origin + square @ np.stack([forward, left]))
+        if (corners < low).any() or (corners > high).any():
+            continue
+        z = land.surface_m(origin) + IMU_HEIGHT_M
+        poses[found, :, 0], poses[found, :, 1] = [*forward, 0.0], [*-left, 0.0]
+        poses[found, :, 2], poses[found, :, 3] = [0.0, 0.0, -1.0], [*origin, z]
+        found += 1
+    raise RuntimeError(f"only {found} of {count} free crops fit into the town; request fewer free poses")
