@@ -18,7 +18,6 @@ from models.pipeline import PrITTIPipeline
 from models.scene import Grid, Scene
 from models.tensors import resample_scene_ground
 from pipelines.editing.edit import Repair
-from pipelines.metrics.validity import find_slab_offset_m
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
 from pipelines.runtime.resources import find_device
@@ -219,7 +218,7 @@ class Sampler:
         self.pipeline = load_pipeline(request.model)
         self.pipeline.use_sampler(request.sampler)
         self.pipeline.set_execution(request.execution)
-        self.repair = Repair(slab_offset_m=find_slab_offset_m(self.pipeline.spec.surface), drop=False)
+        self.repair = Repair(slab_offset_m=self.pipeline.spec.slab_offset_m, drop=False)
 
     def __call__(self, row: dict) -> dict:
         request, started = self.request, time.perf_counter()

@@ -9,8 +9,9 @@ from pipelines.schema.tables import read_scenes
 
 def test_sampler_repairs_sampled_scenes(tmp_path):
     from jobs.support.model_directories import find_pipeline_directory
+    from models.layout import SLAB_OFFSET_M
     from pipelines.generation.sample import Sampler, SampleRequest
-    from pipelines.metrics.validity import SLAB_OFFSET_M, find_faults
+    from pipelines.metrics.validity import find_faults
 
     request = SampleRequest(
         find_pipeline_directory("town"), str(tmp_path), "plain", 4, ("low", "high"), 0, 10, 1.0, "dpm++"
