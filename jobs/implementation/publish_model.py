@@ -50,6 +50,7 @@ def publish(config: Config) -> list[str]:
     directory = resolve_path(config.evaluation, "evaluations", "latest")
     about, scores = read_evaluation(directory, weights)
     as_judged = {"existence_threshold": about["sampling"].get("existence_threshold", EXISTENCE_THRESHOLD)}
+    as_judged["constraints"] = about["sampling"].get("constraints", False)
     if about["sampling"]["sampler"] != "ddpm":
         as_judged["noise_scaling"] = about["sampling"].get("noise_scaling", 1.0)
     pipeline.register_to_config(**as_judged)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -130,7 +131,8 @@ class Objects(NamedTuple):
         return torch.isin(self.category, self.category.new_tensor(categories))
 
 
-class Ground(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Ground:
     """Decoded ground without gradient.
 
     Attributes:
@@ -142,6 +144,25 @@ class Ground(NamedTuple):
     probability: Float[Tensor, "b ground rows cols"]
     height_m: Float[Tensor, "b ground rows cols"]
     spec: LayoutSpec
+
+    @cached_property
+    def road(self) -> Float[Tensor, "b rows cols"]:
+        """Probability of road."""
+        return self.find_classes(ROAD_CLASSES)
+
+    @cached_property
+    def forbidden(self) -> tuple[Tensor, Tensor]:
+        """Probabilities of road and of sidewalk beside the road, both (b, 2, rows, cols): sharp, then blurred."""
+        maps = torch.stack([self.road, self.find_classes(("sidewalk",)) * (1 - self.road)], dim=1)
+        return maps, _blur(maps, self.spec.grid.resolution_m)
+
+    @cached_property
+    def slopes(self) -> Float[Tensor, "b 3 rows cols"]:
+        """Products of the slopes of the probability of road: dx^2 - dy^2, 2 dx dy, dx^2 + dy^2."""
+        dx, dy = (torch.zeros_like(self.road) for _ in range(2))  # Rows run against x, columns against y.
+        dx[:, 1:-1] = (self.road[:, :-2] - self.road[:, 2:]) / 2
+        dy[:, :, 1:-1] = (self.road[:, :, :-2] - self.road[:, :, 2:]) / 2
+        return torch.stack([dx * dx - dy * dy, 2 * dx * dy, dx * dx + dy * dy], dim=1)
 
     def find_classes(self, names: Sequence[str]) -> Float[Tensor, "b rows cols"]:
         """Find the probability that a pixel has at least one of some classes.
@@ -432,26 +453,25 @@ def compute_footprint(objects: Objects, ground: Ground) -> Float[Tensor, " scene
     shares = torch.outer(share, share).flatten() / share.sum() ** 2
     sides_m = some.axes[:, :2, :2] * some.size_m[:, None, :2]
     xy_m = some.center_m[:, None, :2] + torch.einsum("nij,pj->npi", sides_m, points)
-    road = ground.find_classes(ROAD_CLASSES)
-    sidewalk = ground.find_classes(("sidewalk",)) * (1 - road)
     inside = _contains(ground.spec, xy_m.detach())
-    maps = torch.stack([road, sidewalk], dim=1)
     # The probability is a step, so its gradient is zero except at the border. The gradient is that of blurred maps.
+    maps, blurred = ground.forbidden
     sharp = ground.sample(maps, some.scene, xy_m.detach()) * inside[:, None]
-    smooth = ground.sample(_blur(maps, ground.spec.grid.resolution_m), some.scene, xy_m)
+    smooth = ground.sample(blurred, some.scene, xy_m)
     found = sharp + torch.where(sharp > MIN_PROBABILITY, smooth - smooth.detach(), 0)
     footprint_m2 = (some.size_m[:, 0] * some.size_m[:, 1]).detach()
     area_m2 = (found * shares).sum(dim=2) * footprint_m2[:, None]
     tolerance_m2 = torch.tensor([allowed.get(k, 0.0) for k in range(len(CATEGORIES))], device=area_m2.device)
     excess_m2 = area_m2[:, 0] + (area_m2[:, 1] - tolerance_m2[some.category]).clamp(min=0)
-    return _sum_scenes(some.existence * excess_m2 / footprint_m2.sqrt(), some.scene, len(road))
+    return _sum_scenes(some.existence * excess_m2 / footprint_m2.sqrt(), some.scene, len(ground.probability))
 
 
 def _blur(maps: Float[Tensor, "b k rows cols"], resolution_m: float) -> Float[Tensor, "b k rows cols"]:
     """Apply a box filter of FOOTPRINT_BLUR_M twice; pixels outside the maps do not count."""
     reach = max(1, round(FOOTPRINT_BLUR_M / resolution_m / 2))
-    for _ in range(2):
-        maps = F.avg_pool2d(maps, 2 * reach + 1, 1, reach, count_include_pad=False)
+    for along, across in ((reach, 0), (0, reach)) * 2:
+        kernel = 2 * along + 1, 2 * across + 1
+        maps = F.avg_pool2d(maps, kernel, 1, (along, across), count_include_pad=False)
     return maps
 
 
@@ -523,34 +543,27 @@ def compute_heading(objects: Objects, ground: Ground) -> Float[Tensor, " scenes"
         Sum of LANE_LENGTH_M * sin^2 of the angle, beyond LANE_TOLERANCE_RAD (m).
     """
     some = objects.take(objects.is_any(VEHICLES))
-    road = ground.find_classes(ROAD_CLASSES)
     with torch.no_grad():
-        along, coherence, is_on_road = _measure_lanes(ground, road, some)
+        along, coherence, is_on_road = _measure_lanes(ground, some)
     cos = (along * some.double_yaw).sum(dim=1)
     deviation = (0.5 * (1 - cos) - np.sin(LANE_TOLERANCE_RAD) ** 2).clamp(min=0)
     weight = some.existence * is_on_road * (coherence > MIN_COHERENCE)
-    return _sum_scenes(weight * LANE_LENGTH_M * deviation, some.scene, len(road))
+    return _sum_scenes(weight * LANE_LENGTH_M * deviation, some.scene, len(ground.probability))
 
 
-def _measure_lanes(ground: Ground, road: Tensor, objects: Objects) -> tuple[Tensor, Tensor, Tensor]:
+def _measure_lanes(ground: Ground, objects: Objects) -> tuple[Tensor, Tensor, Tensor]:
     """Return the direction (n, 2) of the road as cosine and sine of the doubled angle, its coherence, and "on road"."""
     center_m = objects.center_m[:, :2]
     unit = torch.linspace(-LANE_WINDOW_M, LANE_WINDOW_M, LANE_SAMPLES, device=center_m.device)
     offset_m = torch.cartesian_prod(unit, unit)
     xy_m = center_m[:, None] + offset_m
-    # Central differences: rows run against x, columns against y.
-    dx, dy = (torch.zeros_like(road) for _ in range(2))
-    dx[:, 1:-1] = (road[:, :-2] - road[:, 2:]) / 2
-    dy[:, :, 1:-1] = (road[:, :, :-2] - road[:, :, 2:]) / 2
-    tensor = torch.stack([dx * dx - dy * dy, 2 * dx * dy, dx * dx + dy * dy, road], dim=1)
-    found = ground.sample(tensor, objects.scene, xy_m)
+    found = ground.sample(ground.slopes, objects.scene, xy_m)
     weight = torch.exp(-0.5 * (offset_m / LANE_SPREAD_M).square().sum(dim=1)) * _contains(ground.spec, xy_m)
-    across_cos, across_sin, trace = (found[:, :3] * weight[:, None]).sum(dim=2).unbind(dim=1)
+    across_cos, across_sin, trace = (found * weight[:, None]).sum(dim=2).unbind(dim=1)
     length = torch.hypot(across_cos, across_sin)
     along = -torch.stack([across_cos, across_sin], dim=1) / length.clamp(min=1e-9)[:, None]
-    center = len(offset_m) // 2
-    is_on_road = (found[:, 3, center] > 0.5) & _contains(ground.spec, center_m)
-    return along, length / trace.clamp(min=1e-3), is_on_road
+    road = ground.sample(ground.road[:, None], objects.scene, center_m[:, None])[:, 0, 0]
+    return along, length / trace.clamp(min=1e-3), (road > 0.5) & _contains(ground.spec, center_m)
 
 
 def compute_penalties(objects: Objects, ground: Ground, names: Sequence[str]) -> dict[str, Float[Tensor, " scenes"]]:

@@ -122,7 +122,7 @@ def test_height_penalty_is_distance_from_surface(rise_m, side):
     nowhere = make_ground(terrain=column_mask(32, 20))
     assert measure(nowhere, car)["height"] == 0  # There is no ground under the car.
     on_surface = replace(SPEC, surface="surface")
-    ground = make_ground()._replace(spec=on_surface, height_m=torch.zeros_like(make_ground().height_m))
+    ground = replace(make_ground(), spec=on_surface, height_m=torch.zeros_like(make_ground().height_m))
     assert measure(ground, car)["height"] == pytest.approx(1 - limit_m, abs=1e-3)
 
 
