@@ -83,10 +83,10 @@ def test_request_overrides_constraints_of_studio(studio_files):
         client = make_client(studio)
         client.get("/")
         assert client.get("/api/about").json()["constraints"] is bool(default)
-        assert client.post("/api/generate", json={"steps": 4, "constraints": wanted}).status_code == 200
+        assert client.post("/api/generate", json={"steps": 4, "constraints": wanted}, headers=POST).status_code == 200
         wait_until(lambda client=client: client.get("/api/work").json()["finished"])
         assert (studio.pipeline.guidance is not None) is expected
-    assert client.post("/api/generate", json={"steps": 4, "constraints": "lanes"}).status_code == 422
+    assert client.post("/api/generate", json={"steps": 4, "constraints": "lanes"}, headers=POST).status_code == 422
 
 
 def test_only_studio_issues_sessions(studio, client):
