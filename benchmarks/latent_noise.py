@@ -23,7 +23,6 @@ from pipelines.metrics.validity import (
     compute_label_fidelity,
     compute_scene_validity,
     compute_validity_rates,
-    find_slab_offset_m,
 )
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.scene_subset import SceneSubset
@@ -61,7 +60,7 @@ def decode_with_noise(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: 
 
 def format_counts(scenes: list[Scene], dataset: Dataset) -> str:
     """Format the mean count per category and the validity of the scenes."""
-    offset_m = find_slab_offset_m(dataset.spec.surface)
+    offset_m = dataset.spec.slab_offset_m
     counts = np.mean([scene.counts() for scene in scenes], axis=0)
     found = compute_validity_rates(np.array([compute_scene_validity(scene, offset_m) for scene in scenes]))
     fidelity = np.array([compute_label_fidelity(scene, dataset.vegetation, dataset.vehicle) for scene in scenes])

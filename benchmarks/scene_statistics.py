@@ -20,12 +20,13 @@ import numpy as np
 import tyro
 from common import describe_machine, spread, time_interleaved
 
+from models.layout import SLAB_OFFSET_M
 from models.scene import Scene
 from pipelines.geometry.masks import label_parts
 from pipelines.metrics.distributions import compute_scene_histograms
 from pipelines.metrics.relations import fuse_ground, measure_objects, summarise_relations
 from pipelines.metrics.statistics import compute_layout_statistics
-from pipelines.metrics.validity import SLAB_OFFSET_M, compute_category_validity, find_faults
+from pipelines.metrics.validity import compute_category_validity, find_faults
 from pipelines.preprocess.sources.town.generator import generate_town
 
 EARLIER = ("overlapping_iou3d", "floating", "sunken", "over_unknown_ground", "off_road_vehicles")

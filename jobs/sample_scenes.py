@@ -17,7 +17,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import run
-from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, ModelOption, WaitForResourcesOption
+from jobs.support.options import (
+    ConstraintsOption,
+    GpusOption,
+    IfBusyOption,
+    LogFormatOption,
+    ModelOption,
+    WaitForResourcesOption,
+)
 
 
 @dataclass(frozen=True)
@@ -45,6 +52,7 @@ class Config:
     """Divisor of the predicted noise; values above 1 preserve small objects (default: published value; 1 with ddpm)."""
     existence_threshold: float | None = None
     """Keep primitives with a higher existence probability (default: published value; paper: 0.3)."""
+    constraints: ConstraintsOption = None
     repair: bool = False
     """Repair floating, sunken and overlapping objects, as jobs/edit_scenes.py repair --no-drop does."""
     num_actors: int = 1

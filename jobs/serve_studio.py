@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
-from jobs.support.options import ModelOption
+from jobs.support.options import ConstraintsOption, ModelOption
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,7 @@ class Config:
     model: ModelOption = ""
     datasets: tuple[str, ...] = ()
     """Dataset directories from which visitors can open scenes (default: $PRITTI_HOME/generated, if it has scenes)."""
+    constraints: ConstraintsOption = None
     host: str = "127.0.0.1"
     """Address to listen on; visitors need a token unless it is a loopback address and --public-url is not set."""
     port: int = 8600

@@ -16,7 +16,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.support.cli import run
-from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, ModelOption, WaitForResourcesOption
+from jobs.support.options import (
+    ConstraintsOption,
+    GpusOption,
+    IfBusyOption,
+    LogFormatOption,
+    ModelOption,
+    WaitForResourcesOption,
+)
 
 
 @dataclass(frozen=True)
@@ -40,6 +47,7 @@ class Config:
     """Random seed."""
     guidance_scale: float = 1.0
     """Classifier-free guidance scale; 1 switches guidance off."""
+    constraints: ConstraintsOption = None
     batch_size: int = 8
     """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding."""
     num_examples: int = 4

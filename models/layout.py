@@ -36,6 +36,7 @@ GRID_RULES: dict[str, Rule] = {
     "rows": Integer(1, 2**16),
     "cols": Integer(1, 2**16),
 }
+SLAB_OFFSET_M = 0.3  # Height of slab tops above the surface (KITTI-360, town). Argoverse 2 has no slabs.
 NUM_BOUNDS = {"center_bounds_m": 3, "cholesky_bounds": 6, "height_bounds_m": 1}
 
 
@@ -119,6 +120,11 @@ class LayoutSpec:
     def num_slots(self) -> int:
         """Total number of slots over all categories."""
         return sum(self.slots)
+
+    @property
+    def slab_offset_m(self) -> float:
+        """Height of the ground raster above the surface on which objects stand (m)."""
+        return SLAB_OFFSET_M if self.surface == "top" else 0.0
 
     @property
     def slot_category(self) -> np.ndarray:

@@ -258,8 +258,7 @@ class LayoutVAE(ConfiguredModel):
         Raises:
             ValueError: The model has no level sets, and `raster_px` differs from the rows of the LayoutSpec.
         """
-        split = self.config.split_latent and self.config.branches == "both"
-        ground, objects = latent.chunk(2, dim=1) if split else (latent, latent)
+        ground, objects = self.split(latent)
         height, occupancy_logit, distance = self.decode_ground(ground, raster_px)
         found, decoder = self.decode_objects(objects, noised, real), self.object_decoder
         return LayoutOutput(
@@ -276,6 +275,19 @@ class LayoutVAE(ConfiguredModel):
             distance,
             self.reach_px,
         )
+
+    def split(self, latent: Float[Tensor, "batch c2 h w"]) -> tuple[Tensor, Tensor]:
+        """Return the channels that the ground decoder reads, and those that the object decoder reads.
+
+        Args:
+            latent: Joint latents.
+
+        Returns:
+            Ground latent and object latent; both are the joint latent without `split_latent` or with one branch.
+        """
+        is_split = self.config.split_latent and self.config.branches == "both"
+        ground, objects = latent.chunk(2, dim=1) if is_split else (latent, latent)
+        return ground, objects
 
     def decode_ground(
         self, latent: Float[Tensor, "batch c h w"], raster_px: int | None = None

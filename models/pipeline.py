@@ -27,8 +27,9 @@ from models.labels import FREE, find_label_index, split_label
 from models.layout import LayoutSpec
 from models.limits import require_within
 from models.lvae import LayoutVAE
-from models.options import Choice, Number, Rule, Sequential, Text, check_entries, show_value
+from models.options import Choice, Flag, Number, Rule, Sequential, Text, check_entries, show_value
 from models.pretrained import INDEX_NAME, find_pipeline_path
+from models.sampling.constraints import ConstraintConfig, ConstraintGuidance
 from models.sampling.diffusion import (
     GENERATE,
     INPAINT,
@@ -57,6 +58,7 @@ INDEX_RULES: dict[str, Rule] = {
     "noise_scaling": Number(0.9, 1.1),
     "existence_threshold": Number(0, 1),
     "neighbour_latents": Choice(NEIGHBOUR_LATENTS),
+    "constraints": Flag(),
 }
 
 
@@ -123,6 +125,7 @@ class PrITTIPipeline:
         existence_threshold: Only primitives with a higher existence probability are kept; the paper uses 0.3.
         neighbour_latents: How outpainting uses neighbouring blocks by default: "reencode", "copy" or "paper"
             (jobs/outpaint_scenes.py).
+        constraints: Whether constraints guide sampling by default (models/sampling/constraints.py). The paper has none.
 
     Raises:
         ValueError: The LayoutSpec or the shape of the latents of the DiT differs from that of `lvae`, or the noise
@@ -137,13 +140,17 @@ class PrITTIPipeline:
         noise_scaling: float = 1.0,
         existence_threshold: float = EXISTENCE_THRESHOLD,
         neighbour_latents: str = "reencode",
+        constraints: bool = False,
     ) -> None:
         self.lvae, self.dit = lvae.eval().requires_grad_(False), dit.eval().requires_grad_(False)
         self.scheduler = SchedulerConfig.ddpm(dit.diffusion)
         if scheduler is not None:
             self.scheduler = scheduler
         self.config = Config(
-            noise_scaling=noise_scaling, existence_threshold=existence_threshold, neighbour_latents=neighbour_latents
+            noise_scaling=noise_scaling,
+            existence_threshold=existence_threshold,
+            neighbour_latents=neighbour_latents,
+            constraints=constraints,
         )
         self.execution = SamplingExecution()
         # What the last denoiser depends on, its labels, and the denoiser.
@@ -153,6 +160,8 @@ class PrITTIPipeline:
             self.spec.require(LayoutSpec.from_dict(dit.config.layout), "the DiT")
         if (shape := (dit.config.channels, dit.config.size, dit.config.size)) != lvae.latent_shape:
             raise ValueError(f"the DiT generates latents of the shape {shape}, but the layout VAE {lvae.latent_shape}")
+        self.guidance: ConstraintGuidance | None = None
+        self.use_constraints(None)
 
     @classmethod
     def from_pretrained(cls, directory: str | os.PathLike, torch_dtype: torch.dtype | None = None) -> PrITTIPipeline:
@@ -187,7 +196,7 @@ class PrITTIPipeline:
         except ValueError as error:
             raise ValueError(f"{path / SCHEDULER_CONFIG}: {error}") from error
         components = {name: kind.from_pretrained(path / name, torch_dtype) for name, kind in COMPONENTS.items()}
-        names = ("noise_scaling", "existence_threshold", "neighbour_latents")
+        names = ("noise_scaling", "existence_threshold", "neighbour_latents", "constraints")
         thresholds = {name: index[name] for name in names if name in index}
         try:
             return cls(**components, scheduler=scheduler, **thresholds)
@@ -267,7 +276,7 @@ class PrITTIPipeline:
         self.scheduler_config.require_schedule(self.dit.diffusion)
 
     def register_to_config(self, **changes: Any) -> None:
-        """Replace `noise_scaling`, `existence_threshold` or `neighbour_latents`.
+        """Replace `noise_scaling`, `existence_threshold`, `neighbour_latents` or `constraints`.
 
         Args:
             **changes: New values by name.
@@ -304,6 +313,52 @@ class PrITTIPipeline:
         """
         execution.prepare(self.dit)
         self.execution = execution
+
+    def set_constraints(self, config: ConstraintConfig | None) -> None:
+        """Guide sampling, inpainting and outpainting by constraints, or stop the guidance.
+
+        `guidance.report` counts guided steps, and steps without a finite gradient.
+
+        Args:
+            config: Options; None: no guidance.
+
+        Raises:
+            ValueError: A requested constraint is unknown, or the model lacks its categories.
+        """
+        self.guidance = None
+        if config is not None:
+            self.guidance = ConstraintGuidance(config, self.lvae, self._moments, self.diffusion)
+
+    def use_constraints(self, constraints: bool | None) -> None:
+        """Guide sampling by all constraints that the model's categories allow, or stop the guidance.
+
+        Args:
+            constraints: Whether to guide sampling; None: the default of the pipeline.
+        """
+        self.set_constraints(ConstraintConfig() if self.resolve_constraints(constraints) else None)
+
+    def resolve_constraints(self, constraints: bool | None) -> bool:
+        """Return whether constraints guide sampling, or the default of the pipeline if the argument is None.
+
+        Args:
+            constraints: Whether to guide sampling; None: the default.
+
+        Returns:
+            Whether to guide sampling.
+        """
+        return self.config.constraints if constraints is None else constraints
+
+    @contextmanager
+    def _guide(
+        self, model: Denoiser, timesteps: np.ndarray | Tensor, condition: InpaintCondition | None = None
+    ) -> Iterator[Denoiser]:
+        """Yield the denoiser with the guidance of the constraints, if any; log failures of the guidance at the end."""
+        if self.guidance is None:
+            yield model
+            return
+        before = self.guidance.report.fallbacks
+        yield self.guidance.wrap(model, timesteps.tolist(), condition)
+        self.guidance.warn_of_fallbacks(before)
 
     @property
     def device(self) -> torch.device:
@@ -557,7 +612,8 @@ class PrITTIPipeline:
             if self.uses_ddpm:
                 schedule = SamplingSchedule(self.diffusion, num_inference_steps)
                 model = scale_noise(self.make_denoiser(schedule.timesteps, label, guidance_scale), noise_scaling)
-                return sample(model, schedule, noise, label, on_step=on_step)
+                with self._guide(model, schedule.timesteps) as guided:
+                    return sample(guided, schedule, noise, label, on_step=on_step)
             # Raise an error for an invalid number of steps; diffusers would accept it.
             self.diffusion.select_timesteps(num_inference_steps)
             self.scheduler.set_timesteps(num_inference_steps, device=self.device)
@@ -568,7 +624,8 @@ class PrITTIPipeline:
                     "use DPM-Solver++ or DDIM"
                 )
             model = scale_noise(self.make_denoiser(timesteps, label, guidance_scale), noise_scaling)
-            return sample_with_scheduler(model, self.scheduler, noise, label, on_step)
+            with self._guide(model, timesteps) as guided:
+                return sample_with_scheduler(guided, self.scheduler, noise, label, on_step)
 
     def generate(
         self,
@@ -654,9 +711,12 @@ class PrITTIPipeline:
         label = self.label_tensor(labels)
         scaling = 1.0 if repaint.eta == 1 else self.config.noise_scaling
         model = scale_noise(self.make_denoiser(schedule.timesteps, label, guidance_scale), scaling)
-        with self._step_callback(repaint.num_evaluations, callback_on_step_end) as on_step:
+        with (
+            self._step_callback(repaint.num_evaluations, callback_on_step_end) as on_step,
+            self._guide(model, schedule.timesteps, condition) as guided,
+        ):
             return sample(
-                model,
+                guided,
                 schedule,
                 noise,
                 label,

@@ -33,6 +33,9 @@ CATEGORY_INDEX = {name: index for index, name in enumerate(CATEGORIES)}
 ELLIPSOID = CATEGORY_INDEX["vegetation_ellipsoid"]
 VEGETATION = (CATEGORY_INDEX["vegetation_cuboid"], ELLIPSOID)
 VEHICLES = (CATEGORY_INDEX["vehicle_big"], CATEGORY_INDEX["vehicle_small"])
+# Objects to which a sign, a lamp or a signal can be attached, and the largest gap between an object and its support.
+SUPPORTERS = tuple(CATEGORY_INDEX[name] for name in ("construction_big", "construction_small", "pole"))
+SUPPORT_M = 0.3
 
 # The paper's five ground classes and the crossings of Argoverse 2.
 GROUND_CLASSES = ("road", "sidewalk", "parking", "terrain", "ground", "crossing")

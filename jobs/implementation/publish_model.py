@@ -23,7 +23,7 @@ from models.pretrained import CHECKSUMS_NAME, TRAINING_NAME, WEIGHTS, compute_ch
 from models.tensors import EXISTENCE_THRESHOLD
 from models.uris import split_name
 from pipelines.generation.sample import load_pipeline
-from pipelines.metrics.validity import compute_scene_validity, find_slab_offset_m
+from pipelines.metrics.validity import compute_scene_validity
 from pipelines.rendering.render import arrange_contact_sheet, encode_png, render_bev
 from pipelines.reporting.chart import make_standalone_svg
 from pipelines.reporting.model_card import ModelCard, TrainingRecord
@@ -50,6 +50,7 @@ def publish(config: Config) -> list[str]:
     directory = resolve_path(config.evaluation, "evaluations", "latest")
     about, scores = read_evaluation(directory, weights)
     as_judged = {"existence_threshold": about["sampling"].get("existence_threshold", EXISTENCE_THRESHOLD)}
+    as_judged["constraints"] = about["sampling"].get("constraints", False)
     if about["sampling"]["sampler"] != "ddpm":
         as_judged["noise_scaling"] = about["sampling"].get("noise_scaling", 1.0)
     pipeline.register_to_config(**as_judged)
@@ -228,7 +229,7 @@ def compute_hours(tracker, batch_size: int) -> float:
 
 def draw_examples(about: Mapping) -> dict[str, bytes]:
     """Return PNG pictures of the first SHOWN scenes, and of the worst scenes among the first JUDGED scenes."""
-    offset_m = find_slab_offset_m(Dataset.open(about["real"]).spec.surface)
+    offset_m = Dataset.open(about["real"]).spec.slab_offset_m
     scenes = list(read_scenes(about["generated"], about["source"], limit=JUDGED))
     faults = np.array([compute_scene_validity(scene, offset_m)[:-1, 0].sum() for scene in scenes])
     worst = [scenes[k] for k in np.argsort(-faults, kind="stable")[:FAILURES]]

@@ -36,6 +36,7 @@ def sample(config: Config) -> str:
         sampler=config.sampler,
         noise_scaling=config.noise_scaling,
         existence_threshold=config.existence_threshold,
+        constraints=config.constraints,
         repair=config.repair,
         shard_scenes=min(64, max(1, -(-config.num_scenes // 8))),
         execution=SamplingExecution(config.precision, config.cuda_graphs, config.compile, config.decode_batch_size),
@@ -44,7 +45,17 @@ def sample(config: Config) -> str:
         columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TaskProgressColumn(show_speed=True))
         with JobProgress(*columns) as bar:
             shown = bar.add_task("sample scenes", total=config.num_scenes)
-            sample_scenes(request, config.num_actors, config.batch_size, lambda row: bar.advance(shown, row["scenes"]))
+
+            def advance(row: dict) -> None:
+                bar.advance(shown, row["scenes"])
+                if row["fallbacks"]:
+                    total = row["guided"] + row["fallbacks"]
+                    print(
+                        f"constraints: shard {row['id']}: {row['fallbacks']} of {total} guided steps had no finite"
+                        " gradient and continued without guidance"
+                    )
+
+            sample_scenes(request, config.num_actors, config.batch_size, advance)
         for scene in read_scenes(output, f"generated-{config.run}", limit=config.num_glb) if config.num_glb else ():
             path = storage.join_uri(output, "glb", config.run, f"{make_file_name(scene.scene_id)}.glb")
             storage.write_whole(path, lambda stream, scene=scene: stream.write(export_glb(scene)))

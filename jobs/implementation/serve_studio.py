@@ -89,7 +89,7 @@ def serve_studio(config: Config) -> RunningStudio:
         max_area_m2=config.max_area_m2,
     )
     threads = config.num_threads or max(1, (os.cpu_count() or 1) - 1)
-    backend = ActorBackend(model, tables, limits, threads)
+    backend = ActorBackend(model, tables, limits, threads, config.constraints)
     # The access log would contain the token. Addresses in X-Forwarded headers are not used.
     options = uvicorn.Config(
         build_studio_app(backend, gate),

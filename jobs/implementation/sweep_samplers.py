@@ -98,6 +98,7 @@ def sweep_samplers(config: Config) -> list[dict]:
                     guidance_scale=config.guidance_scale,
                     sampler=sampler,
                     noise_scaling=scaling,
+                    constraints=config.constraints,
                     # The shard size does not depend on the number of actors, so this number may change on resumption.
                     shard_scenes=max(1, config.num_scenes // 8),
                 )

@@ -163,6 +163,30 @@ def hide_empty_defaults(options: ModuleType) -> None:
                 cls.__annotations__[field.name] = Annotated[hints[field.name], tyro.conf.arg(help_behavior_hint="")]
 
 
+def expand_flags(cls: type, words: Sequence[str]) -> list[str]:
+    """Add the value to options of the type bool | None that are written as flags.
+
+    tyro needs a value for these options. `--name` becomes `--name True`, and `--no-name` becomes `--name False`.
+
+    Args:
+        cls: Option class.
+        words: Words of the command line.
+
+    Returns:
+        Words for tyro.
+    """
+    hints = get_type_hints(cls)
+    names = {f"--{name.replace('_', '-')}" for name, hint in hints.items() if hint == (bool | None)}
+    expanded = []
+    for word, following in zip(words, (*words[1:], ""), strict=False):
+        positive = f"--{word.removeprefix('--no-')}"
+        if word in names and following not in ("True", "False", "None"):
+            expanded += [word, "True"]
+        else:
+            expanded += [positive, "False"] if word.startswith("--no-") and positive in names else [word]
+    return expanded
+
+
 def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) -> None:
     """Parse the command line of a job, check its options, then import and run its implementation.
 
@@ -183,6 +207,7 @@ def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) ->
         if hasattr(signal, "SIGPIPE"):
             signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `--help | head` ends silently.
     default = {"default": options.DEFAULT} if hasattr(options, "DEFAULT") else {}
+    words = expand_flags(options.Config, words)
     config = tyro.cli(options.Config, args=words, prog=prog, description=options.__doc__, **default)
     set_ray_environment()
     with use_log_format(getattr(config, "log_format", "text")):

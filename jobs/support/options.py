@@ -25,6 +25,13 @@ IfBusyOption = Annotated[
 ]
 
 
+ConstraintsOption = Annotated[
+    bool | None,
+    tyro.conf.arg(
+        help="Guide sampling by constraints, so that objects overlap, float and stand on the road less often; write"
+        " --constraints or --no-constraints (default: as the model stores)."
+    ),
+]
 GpusOption = Annotated[
     float | None,
     tyro.conf.arg(
@@ -73,6 +80,7 @@ class GenerationOptions(SceneOptions):
     """Random seed."""
     guidance_scale: float = 1.0
     """Classifier-free guidance scale; 1 switches guidance off."""
+    constraints: ConstraintsOption = None
     num_actors: int = 1
     """Number of pipelines that run in parallel; use one per GPU."""
     gpus: GpusOption = None

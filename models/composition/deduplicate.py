@@ -9,14 +9,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
-from models.scene import CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
+from models.geometry.suppression import DUPLICATE_IOU3D, find_suppressed
+from models.scene import Scene
 
-# NMS threshold per category: two objects of the same category are duplicates if their IoU3D is higher. In the town's
-# 1,000 held-out scenes, the IoU3D is at most 0.04 for two vehicles and at most 0.1 for two buildings. In these scenes,
-# the thresholds would remove 4.6 % of fences, 3.4 % of signs, 2.2 % of poles and 0.8 % of other objects.
-DUPLICATE_IOU3D = np.full(len(CATEGORY_INDEX), 0.15)
-DUPLICATE_IOU3D[list(VEGETATION)] = 0.3  # Tree crowns overlap. The value applies only at borders of known regions.
-DUPLICATE_IOU3D[list(VEHICLES)] = 0.05
 REGENERATED_IOU3D = 0.05  # The IoU3D of a known object and its displaced copy is higher.
 
 
@@ -48,8 +43,7 @@ def find_regenerated_objects(generated: Scene, known: Scene) -> np.ndarray:
 def find_lower_confidence_duplicates(scene: Scene) -> np.ndarray:
     """Find the solid objects that non-maximum suppression removes.
 
-    Two objects are duplicates if their IoU3D exceeds DUPLICATE_IOU3D of their category. The object with the higher
-    existence probability is kept. Vegetation is never a duplicate, because tree crowns overlap in reality.
+    See `find_suppressed` for the rule.
 
     Args:
         scene: Decoded scene.
@@ -57,15 +51,4 @@ def find_lower_confidence_duplicates(scene: Scene) -> np.ndarray:
     Returns:
         (n,) bool; True for each object to remove.
     """
-    solid = np.flatnonzero(~np.isin(scene.category, VEGETATION))
-    order = solid[np.argsort(-scene.existence[solid], kind="stable")]  # highest confidence first
-    boxes, category = extract_boxes(scene).take(order), scene.category[order]
-    later = np.triu(category[:, None] == category[None], 1)
-    overlaps = compute_iou3d_matrix(boxes, boxes, later) > DUPLICATE_IOU3D[category, None]
-    suppressed = np.zeros(len(order), bool)
-    for k in np.flatnonzero(overlaps.any(axis=1)):
-        if not suppressed[k]:
-            suppressed |= overlaps[k]
-    mask = np.zeros(len(scene), bool)
-    mask[order[suppressed]] = True
-    return mask
+    return find_suppressed(extract_boxes(scene), scene.category, scene.existence)

@@ -21,6 +21,7 @@ import pyarrow as pa
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from models.composition.inpaint import contains_points
+from models.layout import SLAB_OFFSET_M
 from models.scene import (
     CATEGORIES,
     CATEGORY_INDEX,
@@ -30,7 +31,6 @@ from models.scene import (
     make_yaw_rotation,
 )
 from pipelines.editing.repair import GroundFaults, find_removable_objects, separate_objects, snap_to_ground
-from pipelines.metrics.validity import SLAB_OFFSET_M
 from pipelines.schema.tables import PRIMITIVES, make_primitives_table
 from pipelines.schema.validation import MAX_COORDINATE_M
 

@@ -142,7 +142,7 @@ def drop_blank(described: StoredFeatures) -> tuple[StoredFeatures, int]:
 
 def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
     """Compute layout statistics, relations, histograms, validity and label fidelity of scenes of a dataset."""
-    slab_offset_m = validity.find_slab_offset_m(dataset.spec.surface)
+    slab_offset_m = dataset.spec.slab_offset_m
     rows: dict[str, list[np.ndarray]] = defaultdict(list)
     for scene in scenes:
         classes = dataset.spec.ground_classes

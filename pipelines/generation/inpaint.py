@@ -97,6 +97,7 @@ class InpaintRequest(Request):
         repaint: RePaint options.
         guidance_scale: Scale of classifier-free guidance.
         execution: How the model runs.
+        constraints: Whether constraints guide sampling. None: the value that the model stores.
     """
 
     where: RegionConfig
@@ -107,6 +108,7 @@ class InpaintRequest(Request):
     repaint: RePaintConfig
     guidance_scale: float
     execution: SamplingExecution = field(default_factory=SamplingExecution)
+    constraints: bool | None = None
 
 
 def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
@@ -230,6 +232,7 @@ class Inpainter:
     def __init__(self, request: InpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
         self.request, self.chosen = request, chosen
         self.pipeline = load_pipeline(request.model)
+        self.pipeline.use_constraints(request.constraints)
         self.pipeline.set_execution(request.execution)
 
     def __call__(self, row: dict) -> dict:
@@ -288,6 +291,7 @@ def inpaint_scenes(
     )  # An invalid region raises its error here, before actors start.
     if request.label:
         require_labels(pipeline.dit.config.label, [request.label])
+    request = replace(request, constraints=pipeline.resolve_constraints(request.constraints))
     guard_generation_run(
         request,
         pipeline,

@@ -61,6 +61,7 @@ class OutpaintRequest(Request):
         order: Order in which blocks are generated (a key of RANKS).
         batch_size: Maximum number of blocks per batch.
         execution: How the model runs.
+        constraints: Whether constraints guide sampling. None: the value that the model stores.
     """
 
     label: str | None
@@ -73,6 +74,7 @@ class OutpaintRequest(Request):
     order: str = "outward"
     batch_size: int = 4
     execution: SamplingExecution = field(default_factory=SamplingExecution)
+    constraints: bool | None = None
 
     def scene_id(self, number: int) -> str:
         """Return the id of an extended scene.
@@ -213,6 +215,7 @@ class Outpainter:
     def __init__(self, request: OutpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
         self.request, self.chosen = request, chosen
         self.pipeline = load_pipeline(request.model)
+        self.pipeline.use_constraints(request.constraints)
         self.pipeline.set_execution(request.execution)
 
     @cached_property
@@ -341,7 +344,11 @@ def outpaint_scenes(
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
-    request = replace(request, mode=request.mode or pipeline.config.neighbour_latents)
+    request = replace(
+        request,
+        mode=request.mode or pipeline.config.neighbour_latents,
+        constraints=pipeline.resolve_constraints(request.constraints),
+    )
     block_grid = request.make_block_grid(pipeline.latent_shape[-1])
     parts = [storage.join_uri(request.output, "blocks", request.run)]
     guard_generation_run(request, pipeline, parts, input=asdict(selection), scenes=selection.files())

@@ -15,10 +15,10 @@ from models.execution import SamplingExecution
 from models.labels import LABELS, compose_label, require_labels
 from models.layout import LayoutSpec
 from models.pipeline import PrITTIPipeline
+from models.sampling.constraints import GuidanceReport
 from models.scene import Grid, Scene
 from models.tensors import resample_scene_ground
 from pipelines.editing.edit import Repair
-from pipelines.metrics.validity import find_slab_offset_m
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
 from pipelines.runtime.resources import find_device
@@ -71,6 +71,7 @@ class SampleRequest(Request):
         sampler: Name of the sampler.
         noise_scaling: Noise scaling. None: the value that the model stores.
         existence_threshold: Minimum existence probability. None: the value that the model stores.
+        constraints: Whether constraints guide sampling. None: the value that the model stores.
         repair: Whether floating, sunken and overlapping primitives are moved; none are removed
             (pipelines/editing/edit.py).
         shard_scenes: Number of scenes per shard.
@@ -85,6 +86,7 @@ class SampleRequest(Request):
     sampler: str = "ddpm"
     noise_scaling: float | None = None
     existence_threshold: float | None = None
+    constraints: bool | None = None
     repair: bool = False
     shard_scenes: int = 64
     execution: SamplingExecution = field(default_factory=SamplingExecution)
@@ -145,7 +147,8 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
     if "execution" in options:
         del options["execution"]["cuda_graphs"]  # CUDA graphs run the same kernels.
     # Records written by earlier versions lack these options.
-    defaults = {"repair": False, "execution": {"precision": "fp32", "compile": False, "decode_batch_size": 1}}
+    execution = {"precision": "fp32", "compile": False, "decode_batch_size": 1}
+    defaults = {"constraints": False, "repair": False, "execution": execution}
     options = {name: value for name, value in options.items() if name not in defaults or value != defaults[name]}
     # The sampler uses the noise scaling only if eta is not 1.
     if "repaint" in options and options["repaint"]["eta"] != 1:
@@ -212,6 +215,7 @@ class Sampler:
     """Actor that generates and writes scenes, one shard per row.
 
     The input row holds a shard number. The output row holds the shard number, the count of scenes and the duration (s).
+    It also holds the numbers of guided steps and of fallbacks (`GuidanceReport`).
     """
 
     def __init__(self, request: SampleRequest, batch_size: int) -> None:
@@ -219,10 +223,11 @@ class Sampler:
         self.pipeline = load_pipeline(request.model)
         self.pipeline.use_sampler(request.sampler)
         self.pipeline.set_execution(request.execution)
-        self.repair = Repair(slab_offset_m=find_slab_offset_m(self.pipeline.spec.surface), drop=False)
+        self.repair = Repair(slab_offset_m=self.pipeline.spec.slab_offset_m, drop=False)
 
     def __call__(self, row: dict) -> dict:
         request, started = self.request, time.perf_counter()
+        self.pipeline.use_constraints(request.constraints)  # Start new counts.
         shard = request.shards()[row["id"]]
         indices = request.indices(shard)
         scenes = []
@@ -231,7 +236,9 @@ class Sampler:
         if request.repair:
             scenes = [self.repair.apply_to(scene, np.ones(len(scene), bool))[0] for scene in scenes]
         shard.write(scenes)
-        return {"id": shard.number, "scenes": len(indices), "seconds": time.perf_counter() - started}
+        report = self.pipeline.guidance.report if self.pipeline.guidance else GuidanceReport()
+        row = {"id": shard.number, "scenes": len(indices), "seconds": time.perf_counter() - started}
+        return row | {"guided": report.guided, "fallbacks": report.fallbacks}
 
     def generate(self, indices: Sequence[int]) -> list[Scene]:
         """Generate the scenes of a batch.
@@ -289,6 +296,7 @@ def sample_scenes(
         request,
         noise_scaling=pipeline.resolve_noise_scaling(request.noise_scaling),
         existence_threshold=pipeline.resolve_existence_threshold(request.existence_threshold),
+        constraints=pipeline.resolve_constraints(request.constraints),
     )
     guard_generation_run(request, pipeline)
     for shard in request.shards()[:1]:
@@ -297,7 +305,8 @@ def sample_scenes(
     promised = {shard: len(request.indices(shard)) for shard in request.shards()}
     missing = [shard.number for shard in find_unwritten(promised)]
     written = [shard for shard in promised if shard.number not in missing]
-    rows = ({"id": shard.number, "scenes": promised[shard], "seconds": 0.0} for shard in written)
+    nothing = {"seconds": 0.0, "guided": 0, "fallbacks": 0}
+    rows = ({"id": shard.number, "scenes": promised[shard]} | nothing for shard in written)
     total = 0
     for row in chain(rows, map_actors(missing, Sampler, (request, batch_size), num_actors)):
         total += row["scenes"]

@@ -18,7 +18,15 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from skimage.measure import label as label_regions
 
 from models.geometry.iou3d import Boxes, extract_boxes, find_intersecting_pairs, find_overlapping_bounds
-from models.scene import CATEGORIES, CATEGORY_INDEX, GROUND_CLASSES, ROAD_CLASSES, VEGETATION, Scene
+from models.scene import (
+    CATEGORIES,
+    GROUND_CLASSES,
+    ROAD_CLASSES,
+    SUPPORT_M,
+    SUPPORTERS,
+    VEGETATION,
+    Scene,
+)
 from pipelines.metrics.distributions import NO_GROUND, Histogram
 
 EDGE_LIMIT_M = 15.0  # Larger distances from the edge of the road count as this distance.
@@ -26,7 +34,6 @@ NEAR_EDGE_M = 1.0
 NEIGHBOUR_RANGE_M = (0.1, 60.0)  # Distances between neighbours are clipped to this range before the logarithm.
 TOUCHING_M = 0.5  # Objects of one category whose centres are closer than this distance are probably duplicates.
 EDGE_PIXELS = 12  # The direction of the edge is that of the line through this number of edge pixels.
-SUPPORT_M = 0.3  # Largest gap between an object and its support.
 SUPPORT_RANGE_M = 3.0  # Larger gaps between an object and the ground count as this gap.
 FOOTPRINT_POINTS = 5  # Number of points along each side of a footprint.
 SMALL_PART_M2 = 1.0
@@ -43,8 +50,6 @@ GROUPS = {
     "furniture": ("pole", "traffic_control", "object"),
 }
 GROUP_OF = np.array([next(k for k, names in enumerate(GROUPS.values()) if name in names) for name in CATEGORIES])
-# Objects to which a sign, a lamp or a signal can be attached.
-SUPPORTERS = tuple(CATEGORY_INDEX[name] for name in ("construction_big", "construction_small", "pole"))
 SUPPORTS = ("ground", "pole, wall or building", "nothing")
 UNSUPPORTED = len(SUPPORTS) - 1
 

@@ -63,7 +63,6 @@ ON_GROUND_M2 = 1.0
 FOOTPRINT_STEP_M = 0.5
 LANE_ANGLE_RAD = np.pi / 4
 TOLERANCE_M = 0.5
-SLAB_OFFSET_M = 0.3  # Height of slab tops above the surface (KITTI-360, town). Argoverse 2 has no slabs.
 SOLID = tuple(c for c in range(len(CATEGORIES)) if c not in VEGETATION)
 # Categories whose primitives stand on the ground. In a real drive of KITTI-360, 0 % of the primitives in these
 # categories float and 7 % are sunken. The other categories are excluded, because many of their primitives in this drive
@@ -75,18 +74,6 @@ STANDING = tuple(
 )
 CONSTRUCTIONS = (CATEGORY_INDEX["construction_big"], CATEGORY_INDEX["construction_small"])
 ATTACHED = (CATEGORY_INDEX["traffic_control"], CATEGORY_INDEX["pole"])
-
-
-def find_slab_offset_m(surface: str) -> float:
-    """Return the height of the ground raster above the surface on which the objects of a dataset stand (m).
-
-    Args:
-        surface: Attribute `surface` of the dataset's LayoutSpec.
-
-    Returns:
-        Offset (m).
-    """
-    return SLAB_OFFSET_M if surface == "top" else 0.0
 
 
 def find_faults(

@@ -35,7 +35,14 @@ MALLOC = {
 class StudioActor:
     """Actor that answers the requests of all visitors."""
 
-    def __init__(self, model: str, datasets: list[str], limits: StudioLimits, threads: int | None) -> None:
+    def __init__(
+        self,
+        model: str,
+        datasets: list[str],
+        limits: StudioLimits,
+        threads: int | None,
+        constraints: bool | None = None,
+    ) -> None:
         import torch
 
         if threads:
@@ -43,7 +50,7 @@ class StudioActor:
         sys.setswitchinterval(0.001)  # Requests wait less for the thread that samples.
         self.error: ValueError | None = None
         try:
-            self.studio = Studio(model, datasets, limits)
+            self.studio = Studio(model, datasets, limits, constraints)
         except ValueError as error:  # An error in __init__ would end the process, with a long log.
             self.error = error
             logger.error("studio: %s", error)
@@ -64,7 +71,14 @@ class StudioActor:
 class ActorBackend:
     """Sends requests to a studio in an actor, which restarts if its process dies."""
 
-    def __init__(self, model: str, datasets: list[str], limits: StudioLimits, threads: int | None = None) -> None:
+    def __init__(
+        self,
+        model: str,
+        datasets: list[str],
+        limits: StudioLimits,
+        threads: int | None = None,
+        constraints: bool | None = None,
+    ) -> None:
         """Start the actor and wait until it has loaded the model.
 
         Args:
@@ -72,6 +86,7 @@ class ActorBackend:
             datasets: Dataset directories.
             limits: Limits of memory and computing time.
             threads: Number of CPU threads for the network. None: all cores.
+            constraints: Whether constraints guide sampling by default. None: the value that the model stores.
 
         Raises:
             ValueError: A directory contains no model, or a dataset contains no readable scenes.
@@ -84,7 +99,7 @@ class ActorBackend:
             max_pending_calls=MAX_PENDING,
             runtime_env={"env_vars": MALLOC},
         )
-        self.actor = actor.remote(model, datasets, limits, threads)
+        self.actor = actor.remote(model, datasets, limits, threads, constraints)
         try:
             ray.get(self.actor.ready.remote())
         except ValueError as error:  # Ray's error is also of the type of its cause.

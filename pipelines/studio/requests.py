@@ -35,6 +35,7 @@ class SamplingRequest(StudioRequest):
     label: str = Field("", max_length=40)
     seed: int = Field(0, ge=0, lt=2**31)
     steps: int = Field(20, ge=1, le=1000)
+    constraints: bool | None = None  # None selects the default of the studio.
 
 
 class GenerateRequest(SamplingRequest):

@@ -71,19 +71,24 @@ def make_json_answer(value: object, status: int = 200, retry_after_s: int = 0) -
 class Studio:
     """The model, the sessions of all visitors, and the datasets from which scenes can be opened."""
 
-    def __init__(self, model: str, datasets: list[str], limits: StudioLimits | None = None) -> None:
+    def __init__(
+        self, model: str, datasets: list[str], limits: StudioLimits | None = None, constraints: bool | None = None
+    ) -> None:
         """Load the model and read the datasets.
 
         Args:
             model: Pipeline directory.
             datasets: Dataset directories. Damaged shards are left out, and the log names them.
             limits: Limits of memory and computing time (default: StudioLimits()).
+            constraints: Whether constraints guide sampling, if a request does not state it. None: the value that the
+                model stores.
 
         Raises:
             ValueError: A directory contains no model, or a dataset contains no readable scenes.
         """
         self.limits = limits or StudioLimits()
         self.pipeline = load_pipeline(model)
+        self.constraints = self.pipeline.resolve_constraints(constraints)
         self.default_scheduler = self.pipeline.scheduler_config
         self.catalogues = [Catalogue.read(root, skip_damaged=True) for root in datasets]
         for path, reason in (item for one in self.catalogues for item in one.damaged.items()):
@@ -126,7 +131,8 @@ class Studio:
 
     def _answer(self, operation: str, visitor: str, request: BaseModel | None) -> Answer:
         if operation == "about":
-            return make_json_answer({"labels": self.labels, "resolution_m": self.pipeline.spec.grid.resolution_m})
+            about = {"labels": self.labels, "resolution_m": self.pipeline.spec.grid.resolution_m}
+            return make_json_answer(about | {"constraints": self.constraints})
         if isinstance(request, ListRequest):
             return make_json_answer(self.list_scenes(request))
         session = self.sessions.open(visitor)
@@ -253,11 +259,16 @@ class Studio:
         self.tasks.put(task)
         session.task = task
 
+    def use_constraints(self, request: SamplingRequest) -> None:
+        """Guide the pipeline as a request states. Only the thread that samples calls this function."""
+        self.pipeline.use_constraints(self.constraints if request.constraints is None else request.constraints)
+
     def generate(self, session: Session, visitor: str, request: GenerateRequest) -> None:
         """Start the generation of a scene."""
         label = self.choose_label(request, None)
 
         def make(task: BackgroundTask) -> Scene:
+            self.use_constraints(request)
             self.pipeline.use_sampler(request.sampler)
             try:
                 return self.pipeline.generate(
@@ -285,6 +296,7 @@ class Studio:
         blocks = len(split_region(self.pipeline, scene, region))
 
         def make(task: BackgroundTask) -> Scene:
+            self.use_constraints(request)
             for step in inpaint_blocks(
                 self.pipeline,
                 scene,
@@ -313,6 +325,7 @@ class Studio:
         label, repaint = self.choose_label(request, scene), request.repaint()
 
         def make(task: BackgroundTask) -> Scene:
+            self.use_constraints(request)
             return self.pipeline.outpaint(
                 scene, label, request.seed, repaint=repaint, callback_on_step_end=task.step, side=request.side
             )

@@ -68,7 +68,7 @@ async function watch() {
 }
 $("cancel").onclick = () => ask("/api/cancel", {}).catch((error) => say(error.message, true));
 
-const sampling = () => ({ label: $("label").value, seed: Math.max(0, Math.floor(+$("seed").value || 0)), steps: Math.max(1, Math.floor(+$("steps").value || 20)) });
+const sampling = () => ({ label: $("label").value, seed: Math.max(0, Math.floor(+$("seed").value || 0)), steps: Math.max(1, Math.floor(+$("steps").value || 20)), constraints: $("constraints").checked });
 $("generate").onclick = () => act("/api/generate", sampling());
 $("another").onclick = () => { $("seed").value = Math.floor(Math.random() * 2 ** 31); $("generate").click(); };
 $("inpaint").onclick = () => act("/api/inpaint", { ...sampling(), polygon_m: region, contents: $("contents").value });
@@ -179,6 +179,7 @@ $("back").onclick = () => { start = Math.max(0, start - 24); list(); };
 $("on").onclick = () => { start += 24; list(); };
 
 const about = await ask("/api/about");
+$("constraints").checked = about.constraints;
 for (const label of about.labels) $("label").append(Object.assign(document.createElement("option"), { value: label, textContent: label }));
 await list();
 await act("/api/state");

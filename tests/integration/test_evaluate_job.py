@@ -10,6 +10,7 @@ from helpers import kill_ray_workers
 
 from jobs.evaluate_scenes import Config
 from jobs.implementation.evaluate_scenes import evaluate
+from models.layout import SLAB_OFFSET_M
 from models.scene import Scene
 from pipelines.evaluation.evaluate import (
     compare_datasets,
@@ -25,7 +26,6 @@ from pipelines.metrics.inception import Inception
 from pipelines.metrics.intervals import Estimate
 from pipelines.metrics.relations import compute_scene_relations
 from pipelines.metrics.statistics import compute_layout_statistics
-from pipelines.metrics.validity import SLAB_OFFSET_M
 from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.rendering.render import render_bev
 from pipelines.schema.dataset import Dataset

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
 import pytest
+import tyro
 
+from jobs.support.cli import expand_flags
 from jobs.support.renames import JOB_OPTIONS, OPTIONS, VALUES, find_renamed
 
 ROOT = Path(__file__).parents[2]
@@ -86,6 +88,7 @@ def test_option_modules_import_nothing_heavy():
 
 
 SHARED = (
+    "ConstraintsOption",
     "ModelOption",
     "IfBusyOption",
     "GpusOption",
@@ -102,6 +105,24 @@ def test_options_have_help_lines(job):
             if isinstance(field, ast.AnnAssign) and ast.unparse(field.annotation) not in SHARED:
                 documented = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
                 assert documented, f"{cls.name}.{field.target.id}"
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ((), None),
+        (("--constraints",), True),
+        (("--no-constraints", "--seed", "3"), False),
+        (("--constraints", "True"), True),
+        (("--constraints", "False"), False),
+        (("--constraints", "None"), None),
+    ],
+)
+def test_flags_without_value_select_true_or_false(words, expected):
+    for name in ("sample_scenes", "inpaint_scenes", "outpaint_scenes", "sweep_samplers", "sweep_seams", "serve_studio"):
+        config = importlib.import_module(f"jobs.{name}").Config
+        given = [word for word in words if name != "serve_studio" or word not in ("--seed", "3")]
+        assert tyro.cli(config, args=expand_flags(config, given)).constraints is expected
 
 
 def test_pritti_lists_all_jobs_with_one_line_each():

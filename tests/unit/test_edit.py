@@ -9,11 +9,12 @@ import pytest
 from helpers import assert_same_primitives, random_scene
 
 from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
+from models.layout import SLAB_OFFSET_M
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, UNSET, Scene, canonicalize_boxes
 from pipelines.editing import edit
 from pipelines.editing.edit import Select, parse_edits, replay_edits, serialize_edits
 from pipelines.io.mesh_export import triangulate_scene
-from pipelines.metrics.validity import SLAB_OFFSET_M, compute_scene_validity, compute_validity_rates, find_faults
+from pipelines.metrics.validity import compute_scene_validity, compute_validity_rates, find_faults
 
 CAR = CATEGORY_INDEX["vehicle_small"]
 SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T

@@ -7,10 +7,32 @@ import numpy as np
 from pipelines.schema.tables import read_scenes
 
 
+def test_sampler_guides_scenes_by_constraints(tmp_path):
+    from jobs.support.model_directories import find_pipeline_directory
+    from models.layout import SLAB_OFFSET_M
+    from pipelines.generation.sample import Sampler, SampleRequest
+    from pipelines.metrics.validity import find_faults
+
+    request = SampleRequest(
+        find_pipeline_directory("town"), str(tmp_path), "plain", 4, ("low", "high"), 0, 10, 1.0, "dpm++"
+    )
+    faults = []
+    for one in (request, replace(request, run="guided", constraints=True)):
+        sampler = Sampler(one, batch_size=4)
+        rows = [sampler({"id": 0}) for _ in range(2)]
+        steps = {row["guided"] for row in rows}  # Each shard has its own count.
+        assert steps == ({8} if one.constraints else {0}) and not rows[0]["fallbacks"]
+        made = read_scenes(str(tmp_path), source=one.source)
+        found = [find_faults(scene, SLAB_OFFSET_M) for scene in made]
+        faults.append(sum(f[name][0].sum() for f in found for name in ("overlapping", "floating", "sunken")))
+    assert faults[1] < 0.9 * faults[0]
+
+
 def test_sampler_repairs_sampled_scenes(tmp_path):
     from jobs.support.model_directories import find_pipeline_directory
+    from models.layout import SLAB_OFFSET_M
     from pipelines.generation.sample import Sampler, SampleRequest
-    from pipelines.metrics.validity import SLAB_OFFSET_M, find_faults
+    from pipelines.metrics.validity import find_faults
 
     request = SampleRequest(
         find_pipeline_directory("town"), str(tmp_path), "plain", 4, ("low", "high"), 0, 10, 1.0, "dpm++"

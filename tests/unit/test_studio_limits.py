@@ -72,6 +72,23 @@ def test_token_is_exchanged_for_cookie_by_redirect(studio):
         Gate("short")
 
 
+def test_request_overrides_constraints_of_studio(studio_files):
+    for default, wanted, expected in (
+        (None, None, False),
+        (True, None, True),
+        (True, False, False),
+        (None, True, True),
+    ):
+        studio = Studio(str(studio_files / "model"), [str(studio_files / "tables")], constraints=default)
+        client = make_client(studio)
+        client.get("/")
+        assert client.get("/api/about").json()["constraints"] is bool(default)
+        assert client.post("/api/generate", json={"steps": 4, "constraints": wanted}, headers=POST).status_code == 200
+        wait_until(lambda client=client: client.get("/api/work").json()["finished"])
+        assert (studio.pipeline.guidance is not None) is expected
+    assert client.post("/api/generate", json={"steps": 4, "constraints": "lanes"}, headers=POST).status_code == 422
+
+
 def test_only_studio_issues_sessions(studio, client):
     """Invented, foreign and expired cookies open no session and delete none."""
     client.post("/api/open", json={"scene_id": "given-1"}, headers=POST)
