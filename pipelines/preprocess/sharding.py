@@ -73,7 +73,8 @@ def plan_town(
         The tasks.
     """
     parts = generator.plan_town_parts(num_train, num_test, seed)
-    plan, done = [], dict.fromkeys((TRAIN, TEST), 0)
+    plan: list[tuple[str, ShardPart]] = []
+    done: dict[str, int] = {TRAIN: 0, TEST: 0}
     for town_seed, split, count in parts:
         # Rounding the cumulative number makes the share exact in each split.
         num_free = round((done[split] + count) * free_pose_share) - round(done[split] * free_pose_share)

@@ -10,7 +10,7 @@ import trimesh
 from PIL import Image
 
 from models.scene import Scene
-from pipelines.io.mesh_export import triangulate_scene
+from pipelines.io.mesh_export import GROUND, build_painted_ground, triangulate_scene
 from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.schema.palette import CATEGORY_IDS
 from pipelines.schema.tables import Shard
@@ -60,13 +60,11 @@ def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluste
     path = Path(output)
     mesh = trimesh.load(path / "ply" / f"{town_scenes[0].scene_id}.ply", process=False)
     soup = triangulate_scene(town_scenes[0])
-    assert len(mesh.faces) == len(soup.corners_m)
-    assert np.allclose(
-        np.sort(mesh.area_faces),
-        np.sort(
-            trimesh.Trimesh(
-                soup.corners_m.reshape(-1, 3), np.arange(3 * len(soup.corners_m)).reshape(-1, 3), process=False
-            ).area_faces
-        ),
-        atol=1e-3,
+    objects = soup.corners_m[soup.primitive != GROUND]
+    vertices_m, triangles, _ = build_painted_ground(town_scenes[0])
+    truth = trimesh.Trimesh(
+        np.concatenate([vertices_m, objects.reshape(-1, 3)]),
+        np.concatenate([triangles, len(vertices_m) + np.arange(3 * len(objects)).reshape(-1, 3)]),
+        process=False,
     )
+    assert np.allclose(np.sort(mesh.area_faces), np.sort(truth.area_faces), atol=1e-3)
