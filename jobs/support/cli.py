@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
 from inspect import get_annotations
 from types import ModuleType
-from typing import Annotated, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 import tyro
 
@@ -163,20 +163,21 @@ def hide_empty_defaults(options: ModuleType) -> None:
                 cls.__annotations__[field.name] = Annotated[hints[field.name], tyro.conf.arg(help_behavior_hint="")]
 
 
-def expand_flags(cls: type, words: Sequence[str]) -> list[str]:
+def expand_flags(cls: Any, words: Sequence[str]) -> list[str]:
     """Add the value to options of the type bool | None that are written as flags.
 
     tyro needs a value for these options. `--name` becomes `--name True`, and `--no-name` becomes `--name False`.
 
     Args:
-        cls: Option class.
+        cls: Option class, or union of the option classes of subcommands.
         words: Words of the command line.
 
     Returns:
         Words for tyro.
     """
-    hints = get_type_hints(cls)
-    names = {f"--{name.replace('_', '-')}" for name, hint in hints.items() if hint == (bool | None)}
+    classes = [cls] if isinstance(cls, type) else [getattr(part, "__origin__", part) for part in get_args(cls)]
+    hints = [pair for one in classes for pair in get_type_hints(one).items()]
+    names = {f"--{name.replace('_', '-')}" for name, hint in hints if hint == (bool | None)}
     expanded = []
     for word, following in zip(words, (*words[1:], ""), strict=False):
         positive = f"--{word.removeprefix('--no-')}"
