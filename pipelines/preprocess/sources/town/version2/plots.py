@@ -26,6 +26,7 @@ from pipelines.preprocess.sources.town.version2.assets import (
 NOTHING, TERRAIN, GROUND, PARKING = -1, 0, 1, 2
 CELL_CLASS = ("terrain", "ground", "parking")
 MIN_FRONT_M = 5.0
+MIN_PIECE_M = 0.15
 Kind = Literal["detached", "terrace", "perimeter", "court", "green"]
 COURT_M = (7.5, 13.0)  # Depth of a car park in front of houses.
 
@@ -295,7 +296,7 @@ def paint_plot(
         here = []
         for value, (a, b, c, d) in rects:
             a, b, c, d = max(a, 0.0), min(b, width), max(c, low), min(d, high)
-            if b - a > 0.05 and d - c > 0.05:
+            if b - a > MIN_PIECE_M and d - c > MIN_PIECE_M:
                 here.append((value, a, b, c, d))
         s = _list_lines([0.0, width] + [x for r in here for x in r[1:3]])
         t = _list_lines([low, high] + [x for r in here for x in r[3:5]])
@@ -308,9 +309,13 @@ def paint_plot(
 
 
 def _list_lines(values: list[float]) -> list[float]:
-    """Return sorted distinct grid lines with a spacing of at least 1 cm."""
-    out: list[float] = []
-    for value in sorted(values):
-        if not out or value - out[-1] > 0.01:
+    """Return sorted grid lines with a spacing of at least MIN_PIECE_M; the smallest and the largest value are kept.
+
+    A thinner piece of ground could cross itself when the board is bent.
+    """
+    ordered = sorted(values)
+    out = [float(ordered[0])]
+    for value in ordered:
+        if value - out[-1] > MIN_PIECE_M and ordered[-1] - value > MIN_PIECE_M:
             out.append(float(value))
-    return out
+    return [*out, float(ordered[-1])]
