@@ -1,5 +1,6 @@
 """Tests of labels: names, indices, parts and their dropout in training."""
 
+import pyarrow as pa
 import pytest
 import torch
 
@@ -14,6 +15,7 @@ from models.labels import (
     split_label,
 )
 from models.training import make_diffusion_loss
+from pipelines.training.data_loader import label_indices
 
 
 @pytest.mark.parametrize("kind", LABELS)
@@ -66,3 +68,15 @@ def test_training_drops_each_part_at_its_rate():
     names = ("medium-high-free", "any-any-free", "any-high-free", "medium-any-free")
     for name, expected in zip(names, (kept, both, *[(0.9 - kept - both) / 2] * 2), strict=True):
         assert share[LABELS["partial"].index(name)] == pytest.approx(expected, abs=0.025)
+
+
+def test_labels_are_read_from_scenes_table():
+    columns = {
+        "vegetation_density": ["low", None, "high"],
+        "vehicle_density": ["high", "medium", None],
+        "free_pose": [False, True, True],
+    }
+    found = label_indices(pa.table(columns), "partial")
+    assert [LABELS["partial"][k] for k in found] == ["low-high", "any-medium-free", "high-any-free"]
+    with pytest.raises(ValueError, match="label 'None' is unknown to a vegetation model"):
+        label_indices(pa.table(columns), "vegetation")
