@@ -137,7 +137,7 @@ def add_steps(site: Site, frame: LocalFrame, s: float, t0: float, t1: float, wal
     length = float(np.clip(rng.uniform(2.0, 6.5), 0.9, max(0.9, t1 - t0)))
     t = t1 - length / 2 if rng.random() < 0.4 else t0 + length / 2
     for side in (-1, 1):
-        if rng.random() < 0.5:
+        if rng.random() < 0.36:
             size = draw_sizes(rng, "wall", 1)[0]
             size[0] = length
             site.sheet.boxes(frame, "wall", s + side * (walk_m / 2 + size[1] / 2), t, size, np.pi / 2)

@@ -15,7 +15,9 @@ from pipelines.preprocess.sources.town.streets import CityBlock, trace_kerb
 from pipelines.preprocess.sources.town.version2.assets import Site, add_cars, add_ellipsoids, add_patch
 from pipelines.preprocess.sources.town.version2.plots import Kind, build_green, build_row, draw_row
 
-CAR_SLOT_M = 6.0
+CAR_SLOT_M = 6.2
+VERGE_M = (2.2, 3.6)  # Depth of a verge with a path, which takes the place of a sidewalk.
+PATH_M = 1.1  # Width of this path.
 BAY_DEPTH_M = 2.3
 NARROW_M = 2.9  # In streets with a smaller half width, cars stand on one side only.
 MIN_CORNER_WALK_M = 0.7  # Least distance of the inner corner of a sidewalk from the kerb, along each street.
@@ -123,6 +125,8 @@ def _build_flank(
 def _draw_side(site: Site, half_street: float) -> Side:
     bay, sidewalk = bool(site.rng.random() < site.district.bays), bool(site.rng.random() < site.district.sidewalks)
     walk = float(site.rng.uniform(*site.district.sidewalk_m)) + (0.6 if half_street > 3.9 else 0.0)
+    if not sidewalk:
+        walk = float(site.rng.uniform(*VERGE_M))
     return Side(walk + BAY_DEPTH_M * bay, sidewalk, bay, half_street)
 
 
@@ -140,9 +144,11 @@ def _build_side(site: Site, block: CityBlock, k: int, sides: list[Side], cuts: l
         end = length - max(r1, side.depth + cut, after.depth + cut) - 0.3
     if side.bay:
         _build_bays(site, frame, start, end, paved)
-    plant_strip(
-        site.sheet, frame, paved, start, end, BAY_DEPTH_M * side.bay, side.depth, 11.0 if side.sidewalk else 18.0
-    )
+    piece = 11.0 if side.sidewalk else 18.0
+    paved_from, paved_to = BAY_DEPTH_M * side.bay, side.depth - (0.0 if side.sidewalk else PATH_M)
+    plant_strip(site.sheet, frame, paved, start, end, paved_from, paved_to, piece)
+    if not side.sidewalk:
+        plant_strip(site.sheet, frame, "ground", start, end, paved_to, side.depth, piece)
     if not side.bay:
         _park_cars(site, frame, start + 4.0, end - 4.0, k, side)
     _add_furniture(site, frame, start, end, k, side, bool(r0))

@@ -150,13 +150,13 @@ def _build_plot(site: Site, frame: LocalFrame, row: Row, plot: Plot) -> None:
     across = row.house_depth * (1.0 if plot.joined else float(np.exp(rng.normal(0, 0.12))))
     walls: Rect = (s0, s0 + plot.front, setback, setback + across)
     height = row.height * float(np.exp(rng.normal(0, 0.03 if plot.joined else 0.12)))
-    _add_building(site, frame, "building", walls, height, 0.0 if plot.joined else float(rng.normal(0, 0.02)))
+    _add_building(site, frame, "building", walls, height, 0.0 if plot.joined else float(rng.normal(0, 0.04)))
     painted: list[tuple[int, Rect]] = [] if row.below else [(NOTHING, walls)]
     taken: list[Rect] = [walls]
     open_front: list[tuple[float, float]] = []
     if not plot.joined and rng.random() < district.passages:
         room = plot.width - plot.front - plot.drive - plot.left if mirrored is False else plot.left
-        wide = min(room, float(rng.uniform(1.5, 3.5)))
+        wide = min(room, float(rng.uniform(1.8, 4.2)))
         side = (walls[1], walls[1] + wide) if not mirrored else (walls[0] - wide, walls[0])
         painted.append((GROUND, (*side, 0.0, setback + across)))
         taken.append((*side, 0.0, setback + across))
