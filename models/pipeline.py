@@ -16,6 +16,12 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from models.base import Config, read_config, write_config
+from models.composition.attachments import (
+    MIN_EXISTENCE,
+    AttachmentReport,
+    resolve_attachments,
+    split_spare_poles,
+)
 from models.composition.deduplicate import find_lower_confidence_duplicates
 from models.composition.extend import Side, extend_scene
 from models.composition.generator import StepCallback
@@ -159,6 +165,7 @@ class PrITTIPipeline:
             self.spec.require(LayoutSpec.from_dict(dit.config.layout), "the DiT")
         if (shape := (dit.config.channels, dit.config.size, dit.config.size)) != lvae.latent_shape:
             raise ValueError(f"the DiT generates latents of the shape {shape}, but the layout VAE {lvae.latent_shape}")
+        self.attachments = AttachmentReport()
         self.guidance: ConstraintGuidance | None = None
         self.use_constraints(None)
 
@@ -419,6 +426,7 @@ class PrITTIPipeline:
         identities: Sequence[Scene],
         existence_threshold: float | None = None,
         deduplicate: bool = True,
+        attach: bool = True,
     ) -> list[Scene]:
         """Decode latents to scenes.
 
@@ -432,6 +440,8 @@ class PrITTIPipeline:
                 the pipeline.
             deduplicate: A cell decoder may propose the same object in two cells. If True, only the proposal with the
                 higher existence probability is kept.
+            attach: Whether signs are attached to poles, walls and buildings, and poles are put on the ground
+                (models/composition/attachments.py). `attachments` counts the changes. The paper does not do this.
 
         Returns:
             One scene per latent.
@@ -445,13 +455,14 @@ class PrITTIPipeline:
             raise ValueError("a latent holds NaN or infinity: the weights of the model are damaged")
         spec, parts = self.spec, latents.split(self.execution.decode_batch_size)
         layouts = [layout for part in parts for layout in self.lvae.decode(part * scale + shift).layouts()]
-        scenes = [
-            decode_layout(layout, spec, identity, threshold)
-            for layout, identity in zip(layouts, identities, strict=True)
-        ]
-        if not (deduplicate and self.lvae.proposes_duplicates):
-            return scenes
-        return [scene.select(~find_lower_confidence_duplicates(scene)) for scene in scenes]
+        least = min(threshold, MIN_EXISTENCE) if attach else threshold
+        scenes = []
+        for layout, identity in zip(layouts, identities, strict=True):
+            scene, spare = split_spare_poles(decode_layout(layout, spec, identity, least), threshold)
+            if deduplicate and self.lvae.proposes_duplicates:
+                scene = scene.select(~find_lower_confidence_duplicates(scene))
+            scenes.append(resolve_attachments(scene, spare, spec.slab_offset_m, self.attachments) if attach else scene)
+        return scenes
 
     def new_identity(self, run: str, seed: int, index: int, label: str) -> Scene:
         """Return an empty Scene that has the id and the labels of the generated scene.
