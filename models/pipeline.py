@@ -17,10 +17,9 @@ from tqdm.auto import tqdm
 
 from models.base import Config, read_config, write_config
 from models.composition.attachments import (
-    MIN_EXISTENCE,
     AttachmentReport,
+    decode_with_spare_poles,
     resolve_attachments,
-    split_spare_poles,
 )
 from models.composition.deduplicate import find_lower_confidence_duplicates
 from models.composition.extend import Side, extend_scene
@@ -53,7 +52,7 @@ from models.sampling.diffusion import (
 from models.sampling.repaint import NUM_INFERENCE_STEPS, RePaintConfig
 from models.sampling.schedulers import SchedulerConfig
 from models.scene import Scene
-from models.tensors import EXISTENCE_THRESHOLD, decode_layout, make_empty_scene, make_layout_batch
+from models.tensors import EXISTENCE_THRESHOLD, make_empty_scene, make_layout_batch
 
 COMPONENTS = {"lvae": LayoutVAE, "dit": DiT}
 NEIGHBOUR_LATENTS = ("reencode", "copy", "paper")
@@ -455,10 +454,9 @@ class PrITTIPipeline:
             raise ValueError("a latent holds NaN or infinity: the weights of the model are damaged")
         spec, parts = self.spec, latents.split(self.execution.decode_batch_size)
         layouts = [layout for part in parts for layout in self.lvae.decode(part * scale + shift).layouts()]
-        least = min(threshold, MIN_EXISTENCE) if attach else threshold
         scenes = []
         for layout, identity in zip(layouts, identities, strict=True):
-            scene, spare = split_spare_poles(decode_layout(layout, spec, identity, least), threshold)
+            scene, spare = decode_with_spare_poles(layout, spec, identity, threshold)
             if deduplicate and self.lvae.proposes_duplicates:
                 scene = scene.select(~find_lower_confidence_duplicates(scene))
             scenes.append(resolve_attachments(scene, spare, spec.slab_offset_m, self.attachments) if attach else scene)

@@ -16,7 +16,9 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from models.geometry.iou3d import Boxes, extract_boxes, find_intersecting_pairs
-from models.scene import CATEGORY_INDEX, SUPPORT_M, SUPPORTERS, Scene, concatenate_primitives
+from models.layout import LayoutSpec
+from models.scene import CATEGORIES, CATEGORY_INDEX, SUPPORT_M, SUPPORTERS, Scene, concatenate_primitives
+from models.tensors import DecodedLayout, decode_layout
 
 POLE, SIGN = CATEGORY_INDEX["pole"], CATEGORY_INDEX["traffic_control"]
 GOAL_M = 0.9 * SUPPORT_M  # Gap after a displacement. Rounding in tables keeps it below SUPPORT_M.
@@ -25,7 +27,7 @@ RISE_M = 2.0  # Largest vertical gap.
 # Standard deviations of the horizontal distance and of the height above the top of the pole, over the signs of 256 test
 # scenes of the town.
 SPREAD_M, RISE_SPREAD_M = 0.2, 0.45
-MIN_EXISTENCE = 0.05  # Least existence probability of a pole that a sign can add to the scene.
+MIN_EXISTENCE = 0.001  # Least existence probability of a pole that a sign can add to the scene.
 STEP_M = 2.0  # Largest horizontal displacement of a pole without ground under its centre.
 BISECTIONS = 12
 
@@ -47,18 +49,25 @@ class AttachmentReport:
     unsupported: int = 0
 
 
-def split_spare_poles(scene: Scene, threshold: float) -> tuple[Scene, Scene]:
-    """Split a scene into its objects and improbable poles.
+def decode_with_spare_poles(
+    layout: DecodedLayout, spec: LayoutSpec, identity: Scene, threshold: float
+) -> tuple[Scene, Scene]:
+    """Convert a decoded layout to a scene, and its improbable poles to another scene.
 
     Args:
-        scene: Scene with all objects above the lower of `threshold` and MIN_EXISTENCE.
+        layout: Output of a decoder.
+        spec: LayoutSpec that defines the encoding.
+        identity: Scene whose ids, pose and labels are copied to the results.
         threshold: Existence threshold of the scene.
 
     Returns:
-        Scene with the objects above the threshold, and scene with the other poles.
+        Scene with the objects above the threshold, and scene with the poles between MIN_EXISTENCE and the threshold.
     """
-    kept = scene.existence > threshold
-    return scene.select(kept), scene.select(~kept & (scene.category == POLE) & (scene.existence > MIN_EXISTENCE))
+    is_pole = np.array([name == CATEGORIES[POLE] for name in spec.categories])[layout.category]
+    wanted = (layout.existence > threshold) | (is_pole & (layout.existence > MIN_EXISTENCE))
+    found = decode_layout(replace(layout, existence=np.where(wanted, layout.existence, 0)), spec, identity, 0)
+    kept = found.existence > threshold
+    return found.select(kept), found.select(~kept)
 
 
 def resolve_attachments(
@@ -80,17 +89,20 @@ def resolve_attachments(
         Scene with the same objects, and the added poles at the end.
     """
     report = report or AttachmentReport()
-    count = len(scene)
-    merged = replace(scene, **concatenate_primitives([scene, spare]))
-    lifted = find_lifted_poles(merged, slab_offset_m)
-    grounded = put_on_ground(merged, lifted, slab_offset_m)
-    signs = np.flatnonzero((merged.category == SIGN) & (np.arange(len(merged)) < count))
+    count, is_sign = len(scene), scene.category == SIGN
+    apart_m = np.linalg.norm(spare.center_m[:, None, :2] - scene.center_m[is_sign, :2], axis=2)
+    spare = spare.select((apart_m < RANGE_M + STEP_M).any(axis=1))
+    lifted = find_lifted_poles(scene, slab_offset_m)
+    # Spare poles must not count as supporters of each other or of the poles of the scene.
+    parts = put_on_ground(scene, lifted, slab_offset_m), put_on_ground(spare, spare.category == POLE, slab_offset_m)
+    merged = replace(scene, **concatenate_primitives(parts))
+    signs = np.flatnonzero(is_sign)  # The spare poles come after the objects of the scene.
     supporters = np.flatnonzero(np.isin(merged.category, SUPPORTERS))
-    boxes = extract_boxes(grounded)
+    boxes = extract_boxes(merged)
     touching = find_contacts(boxes.take(signs), boxes.take(supporters), SUPPORT_M)
     hanging = signs[~touching[:, supporters < count].any(axis=1)]
     used = np.arange(len(merged)) < count
-    report.lowered += int(lifted[:count].sum())
+    report.lowered += int(lifted.sum())
     for sign in hanging:
         cost, nearest_m = _rate_supporters(boxes, sign, supporters, merged.existence[supporters])
         if not len(supporters) or not np.isfinite(cost.min()):
@@ -101,7 +113,7 @@ def resolve_attachments(
         report.moved += 1
         report.added += int(not used[supporters[best]])
         used[supporters[best]] = True
-    return replace(grounded, center_m=boxes.center_m.astype(np.float32)).select(used)
+    return replace(merged, center_m=boxes.center_m.astype(np.float32)).select(used)
 
 
 def find_lifted_poles(scene: Scene, slab_offset_m: float) -> np.ndarray:

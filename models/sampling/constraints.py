@@ -34,7 +34,7 @@ from models.sampling.penalties import (
     sum_penalties,
 )
 
-DEFAULT_WEIGHTS = MappingProxyType({"footprint": 5.0, "heading": 10.0})
+DEFAULT_WEIGHTS = MappingProxyType({"footprint": 10.0, "heading": 10.0})
 logger = logging.getLogger(__name__)
 
 
@@ -60,11 +60,11 @@ class ConstraintConfig:
 
     names: tuple[str, ...] | None = None
     weights: Mapping[str, float] = field(default_factory=lambda: DEFAULT_WEIGHTS)
-    last: float = 0.6
+    last: float = 0.5
     every: int = 2
-    iterations: int = 5
-    step: float = 0.6
-    trust: float = 2.0
+    iterations: int = 4
+    step: float = 1.0
+    trust: float = 4.0
 
     def __post_init__(self) -> None:
         if not 0 < self.last <= 1:

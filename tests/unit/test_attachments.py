@@ -14,7 +14,6 @@ from models.composition.attachments import (
     STEP_M,
     AttachmentReport,
     resolve_attachments,
-    split_spare_poles,
 )
 from models.composition.generator import SceneGenerator
 from models.layout import SLAB_OFFSET_M, LayoutSpec
@@ -112,9 +111,8 @@ def test_sign_is_attached_to_wall():
 
 
 def test_sign_adds_improbable_pole():
-    scene = build_scene(sign(20, 0.8), pole(20, 0, existence=0.2), pole(40, 0, existence=0.2), pole(50, 0))
-    kept, spare = split_spare_poles(scene, 0.5)
-    assert kept.category.tolist() == [SIGN, POLE] and len(spare) == 2
+    kept = build_scene(sign(20, 0.8), pole(50, 0))
+    spare = build_scene(pole(20, 0, existence=0.2), pole(21, 0, existence=0.1), pole(40, 0, existence=0.4))
     report = AttachmentReport()
     after = resolve_attachments(kept, spare, SLAB_OFFSET_M, report)
     assert after.category.tolist() == [SIGN, POLE, POLE] and after.center_m[2, 0] == 20
@@ -132,6 +130,12 @@ def test_floating_pole_is_lowered_to_ground_on_slope():
         pole(20.25, 0.25, bottom_m=1.0), (CATEGORY_INDEX["construction_big"], (24, 0, 3), (7, 8, 6), 0.9)
     )
     assert scenes_equal(resolve_attachments(attached, NOTHING, SLAB_OFFSET_M), attached)  # It hangs on the building.
+
+
+def test_spare_poles_do_not_support_floating_pole():
+    scene, spare = build_scene(pole(20, 0, bottom_m=1.0), sign(23, 0)), build_scene(pole(20, 0.3, existence=0.1))
+    after = resolve_attachments(scene, spare, SLAB_OFFSET_M)
+    assert after.bottom_m[0] == pytest.approx(0, abs=1e-4) and len(after) == 2
 
 
 def test_pole_without_ground_moves_to_nearest_ground():
