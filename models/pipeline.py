@@ -16,6 +16,11 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from models.base import Config, read_config, write_config
+from models.composition.attachments import (
+    AttachmentReport,
+    decode_with_spare_poles,
+    resolve_attachments,
+)
 from models.composition.deduplicate import find_lower_confidence_duplicates
 from models.composition.extend import Side, extend_scene
 from models.composition.generator import StepCallback
@@ -48,7 +53,7 @@ from models.sampling.diffusion import (
 from models.sampling.repaint import NUM_INFERENCE_STEPS, RePaintConfig
 from models.sampling.schedulers import SchedulerConfig
 from models.scene import Scene
-from models.tensors import EXISTENCE_THRESHOLD, decode_layout, make_empty_scene, make_layout_batch
+from models.tensors import EXISTENCE_THRESHOLD, make_empty_scene, make_layout_batch
 
 COMPONENTS = {"lvae": LayoutVAE, "dit": DiT}
 NEIGHBOUR_LATENTS = ("reencode", "copy", "paper")
@@ -160,6 +165,7 @@ class PrITTIPipeline:
             self.spec.require(LayoutSpec.from_dict(dit.config.layout), "the DiT")
         if (shape := (dit.config.channels, dit.config.size, dit.config.size)) != lvae.latent_shape:
             raise ValueError(f"the DiT generates latents of the shape {shape}, but the layout VAE {lvae.latent_shape}")
+        self.attachments = AttachmentReport()
         self.guidance: ConstraintGuidance | None = None
         self.use_constraints(None)
 
@@ -420,6 +426,7 @@ class PrITTIPipeline:
         identities: Sequence[Scene],
         existence_threshold: float | None = None,
         deduplicate: bool = True,
+        attach: bool = True,
         raster_px: int | None = None,
     ) -> list[Scene]:
         """Decode latents to scenes.
@@ -434,6 +441,8 @@ class PrITTIPipeline:
                 the pipeline.
             deduplicate: A cell decoder may propose the same object in two cells. If True, only the proposal with the
                 higher existence probability is kept.
+            attach: Whether signs are attached to poles, walls and buildings, and poles are put on the ground
+                (models/composition/attachments.py). `attachments` counts the changes. The paper does not do this.
             raster_px: Number of rows and of columns of the rasters; None: that of the model's grid. Only models whose
                 ground consists of level sets decode another resolution.
 
@@ -455,13 +464,13 @@ class PrITTIPipeline:
         layouts = [
             layout for part in parts for layout in self.lvae.decode(part * scale + shift, raster_px=raster_px).layouts()
         ]
-        scenes = [
-            decode_layout(layout, spec, identity, threshold)
-            for layout, identity in zip(layouts, identities, strict=True)
-        ]
-        if not (deduplicate and self.lvae.proposes_duplicates):
-            return scenes
-        return [scene.select(~find_lower_confidence_duplicates(scene)) for scene in scenes]
+        scenes = []
+        for layout, identity in zip(layouts, identities, strict=True):
+            scene, spare = decode_with_spare_poles(layout, spec, identity, threshold)
+            if deduplicate and self.lvae.proposes_duplicates:
+                scene = scene.select(~find_lower_confidence_duplicates(scene))
+            scenes.append(resolve_attachments(scene, spare, spec.slab_offset_m, self.attachments) if attach else scene)
+        return scenes
 
     def new_identity(self, run: str, seed: int, index: int, label: str) -> Scene:
         """Return an empty Scene that has the id and the labels of the generated scene.

@@ -43,13 +43,16 @@ class SceneGenerator(Protocol):
         """
         ...
 
-    def decode(self, latents: Tensor, identities: Sequence[Scene], *, deduplicate: bool = True) -> list[Scene]:
+    def decode(
+        self, latents: Tensor, identities: Sequence[Scene], *, deduplicate: bool = True, attach: bool = True
+    ) -> list[Scene]:
         """Decode latents to scenes.
 
         Args:
             latents: (b, c, h, w) latents.
             identities: Scenes whose ids and labels are copied to the results.
             deduplicate: If True, keep only one of several proposals for the same object.
+            attach: Whether signs are attached to their supporters, and poles are put on the ground.
 
         Returns:
             One scene per latent.

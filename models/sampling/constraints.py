@@ -14,6 +14,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -33,6 +34,7 @@ from models.sampling.penalties import (
     sum_penalties,
 )
 
+DEFAULT_WEIGHTS = MappingProxyType({"footprint": 10.0, "heading": 10.0})
 logger = logging.getLogger(__name__)
 
 
@@ -42,7 +44,8 @@ class ConstraintConfig:
 
     Attributes:
         names: Constraints, keys of `penalties.CONSTRAINTS`. None: all constraints that the model's categories allow.
-        weights: Weight of each constraint by name; a missing weight is 1.
+        weights: Weight of each constraint by name; a missing weight is 1. The defaults are from a comparison on the
+            released model (docs/experiments/constraints.md).
         last: Share of the denoising steps, from the end, in which sampling is guided.
         every: One of this number of steps is guided; the last step always is.
         iterations: Number of gradient steps per guided step.
@@ -56,12 +59,12 @@ class ConstraintConfig:
     """
 
     names: tuple[str, ...] | None = None
-    weights: Mapping[str, float] = field(default_factory=dict)
-    last: float = 0.4
+    weights: Mapping[str, float] = field(default_factory=lambda: DEFAULT_WEIGHTS)
+    last: float = 0.5
     every: int = 2
     iterations: int = 4
-    step: float = 0.3
-    trust: float = 2.0
+    step: float = 1.0
+    trust: float = 4.0
 
     def __post_init__(self) -> None:
         if not 0 < self.last <= 1:

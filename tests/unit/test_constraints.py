@@ -317,7 +317,7 @@ def test_step_without_finite_gradient_falls_back(constrained, monkeypatch, caplo
     plain = pipeline.sample_latents(LABELS, 3, range(3), 10)
     pipeline.set_constraints(ConstraintConfig())
     guided = pipeline.sample_latents(LABELS, 3, range(3), 10)
-    assert require_guidance(pipeline).report == GuidanceReport(6, 0)
+    assert require_guidance(pipeline).report == GuidanceReport(9, 0)
     usual = constraints.sum_penalties
 
     def damage(found, weights):
@@ -330,8 +330,8 @@ def test_step_without_finite_gradient_falls_back(constrained, monkeypatch, caplo
         damaged = pipeline.sample_latents(LABELS, 3, range(3), 10)
     assert torch.allclose(damaged[1], plain[1], atol=1e-5)
     assert torch.allclose(damaged[[0, 2]], guided[[0, 2]], atol=1e-4)
-    assert require_guidance(pipeline).report == GuidanceReport(4, 2)
-    assert "2 of 6 guided steps had no finite gradient" in caplog.text
+    assert require_guidance(pipeline).report == GuidanceReport(6, 3)
+    assert "3 of 9 guided steps had no finite gradient" in caplog.text
 
 
 def test_nan_in_one_scene_leaves_others_unchanged(constrained):

@@ -21,7 +21,7 @@ def test_sampler_guides_scenes_by_constraints(tmp_path):
         sampler = Sampler(one, batch_size=4)
         rows = [sampler({"id": 0}) for _ in range(2)]
         steps = {row["guided"] for row in rows}  # Each shard has its own count.
-        assert steps == ({8} if one.constraints else {0}) and not rows[0]["fallbacks"]
+        assert steps == ({12} if one.constraints else {0}) and not rows[0]["fallbacks"]
         made = read_scenes(str(tmp_path), source=one.source)
         found = [find_faults(scene, SLAB_OFFSET_M) for scene in made]
         faults.append(sum(f[name][0].sum() for f in found for name in ("overlapping", "floating", "sunken")))

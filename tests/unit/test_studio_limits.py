@@ -193,7 +193,7 @@ def test_damaged_shard_does_not_hide_other_scenes(studio_files, tmp_path):
 
 
 def wait_until(condition) -> None:
-    end = time.monotonic() + 5
+    end = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.005)
