@@ -27,6 +27,7 @@ NOTHING, TERRAIN, GROUND, PARKING = -1, 0, 1, 2
 CELL_CLASS = ("terrain", "ground", "parking")
 MIN_FRONT_M = 5.0
 MIN_PIECE_M = 0.15
+DETACHED_GARAGES = 0.7  # Share of garages with a gap to the house.
 Kind = Literal["detached", "terrace", "perimeter", "court", "green"]
 COURT_M = (7.5, 13.0)  # Depth of a car park in front of houses.
 
@@ -121,7 +122,7 @@ def _plan_plots(site: Site, row: Row, length: float) -> list[Plot]:
         if row.kind in ("detached", "court"):
             front = float(size[rng.integers(0, 2)])
             gaps = rng.uniform(*district.gap_m, 2)
-            drive = float(rng.uniform(4.7, 7.7)) if row.kind == "detached" and rng.random() < district.drives else 0.0
+            drive = float(rng.uniform(5.0, 8.4)) if row.kind == "detached" and rng.random() < district.drives else 0.0
             plot = Plot(front + drive + float(gaps.sum()), front, drive, float(gaps[0]))
         else:
             front = float(rng.uniform(5.6, 7.6) if row.kind == "terrace" else rng.uniform(9.0, 17.0))
@@ -215,7 +216,8 @@ def _build_drive(site: Site, frame: LocalFrame, row: Row, walls: Rect, strip: tu
     if rng.random() < site.district.garages and row.depth - end > 5.0:
         size = draw_sizes(rng, "garage", 1)[0]
         deep = min(float(size[0]), row.depth - end - 0.2)
-        garage = (strip[0] + 0.05, strip[1] - 0.05, end, end + deep)
+        apart = float(rng.uniform(0.3, 0.7)) if rng.random() < DETACHED_GARAGES else 0.05
+        garage = (strip[0] + apart, strip[1] - apart, end, end + deep)
         _add_building(site, frame, "garage", garage, float(size[2]), 0.0)
     if rng.random() < site.district.drive_cars * site.variation.cars and end > 5.0:
         middle = (strip[0] + strip[1]) / 2

@@ -43,8 +43,8 @@ MISSING = 0.2  # Share of inner streets that are omitted. Their ends become T-ju
 # Share and range of the half width of each class of streets.
 STREET_CLASSES = (("residential", 0.54, (2.35, 2.85)), ("collector", 0.32, (3.0, 3.7)), ("main", 0.14, (4.0, 5.0)))
 CORNER_M = (3.5, 7.5)  # Radius of kerbs.
-SKEWED = 0.5  # Share of towns whose streets do not cross at right angles.
-MAX_SKEW = 0.28  # Largest tangent of the deviation from a right angle.
+SKEWED = 0.7  # Share of towns whose streets do not cross at right angles.
+MAX_SKEW = 0.3  # Largest tangent of the deviation from a right angle.
 SKEW_WAVE_M = 4000.0
 SUNK_M = 0.1  # Depth of a building below the lowest point of the surface under its walls.
 FREE_CROP_M = 64.0  # Side of the crop ahead of a free pose.
