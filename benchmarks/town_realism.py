@@ -26,11 +26,11 @@ import tyro
 from common import describe_machine
 from scipy.stats import wasserstein_distance
 
+from models.layout import SLAB_OFFSET_M
 from models.scene import CATEGORY_INDEX, Scene
 from pipelines.io.mesh_import import import_glb
 from pipelines.metrics.controls import CONTROLS, damage_scene
 from pipelines.metrics.relations import GROUND_CLASSES, RELATIONS, compute_scene_relations
-from pipelines.metrics.validity import SLAB_OFFSET_M
 from pipelines.preprocess.sources.town.generator import TOWN_VERSIONS, generate_town, select_poses
 from pipelines.schema.tables import read_scenes
 
