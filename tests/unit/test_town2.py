@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import shapely
 
+from models.layout import SLAB_OFFSET_M
 from models.scene import CATEGORY_INDEX
 from pipelines.metrics.relations import RELATIONS, compute_scene_relations, find_support, fuse_ground, measure_objects
-from pipelines.metrics.validity import SLAB_OFFSET_M
 from pipelines.preprocess.shard_writer import read_drive
 from pipelines.preprocess.sharding import plan_town
 from pipelines.preprocess.sources.drive import STATIC
