@@ -36,7 +36,8 @@ from models.sampling.penalties import (
 )
 
 DEFAULT_WEIGHTS = MappingProxyType({"footprint": 10.0, "heading": 10.0})
-EXISTENCE_M = 2.0  # Penalty (m) of an object that loses its existence probability: objects must move, not vanish.
+# Penalty (m) of an object whose existence probability changes from 0 to 1: objects must move, not appear or vanish.
+EXISTENCE_M = 5.0
 logger = logging.getLogger(__name__)
 
 
@@ -234,19 +235,19 @@ class ConstraintGuidance:
         return _Start(make_ground(output, self.lvae.spec), chosen, existence, output.proposals)
 
     def _measure_each(self, latent: Tensor, start: _Start) -> tuple[dict[str, Tensor], Tensor]:
-        """Return the penalties of latents (m), and the loss (b,) of existence probability since the start."""
+        """Return the penalties of latents (m), and squared changes (b,) of existence since the start."""
         shift, scale = self.moments()
         found = self.lvae.decode_objects(self.lvae.split(latent * scale + shift)[1])
         objects = make_objects(found.features, found.existence_logit, start.proposals, self.lvae.spec, start.chosen)
-        lost = (start.existence - found.existence_logit[start.chosen].float().sigmoid()).clamp(min=0)
-        total = lost.new_zeros(len(latent)).index_add(0, start.chosen[0], lost)
+        change = (found.existence_logit[start.chosen].float().sigmoid() - start.existence).square()
+        total = change.new_zeros(len(latent)).index_add(0, start.chosen[0], change)
         return compute_penalties(objects, start.ground, self.names), total
 
     def _measure(self, latent: Tensor, start: _Start) -> Tensor:
-        penalties, lost = self._measure_each(latent, start)
+        penalties, change = self._measure_each(latent, start)
         if not penalties:
             return latent.new_zeros(len(latent))
-        return sum_penalties(penalties, self.config.weights) + EXISTENCE_M * lost
+        return sum_penalties(penalties, self.config.weights) + EXISTENCE_M * change
 
 
 class _Start(NamedTuple):
