@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -35,6 +36,8 @@ from models.sampling.penalties import (
 )
 
 DEFAULT_WEIGHTS = MappingProxyType({"footprint": 10.0, "heading": 10.0})
+# Penalty (m) of an object whose existence probability changes from 0 to 1: objects must move, not appear or vanish.
+EXISTENCE_M = 5.0
 logger = logging.getLogger(__name__)
 
 
@@ -63,8 +66,8 @@ class ConstraintConfig:
     last: float = 0.5
     every: int = 2
     iterations: int = 4
-    step: float = 1.0
-    trust: float = 4.0
+    step: float = 1.5
+    trust: float = 6.0
 
     def __post_init__(self) -> None:
         if not 0 < self.last <= 1:
@@ -177,10 +180,10 @@ class ConstraintGuidance:
                 start = torch.where(mask.bool(), start, condition.latent.clone().to(start))
             displacement, failed = torch.zeros_like(start), torch.zeros(len(start), dtype=torch.bool).to(start.device)
             with torch.no_grad():
-                ground, chosen = self._decode(start)
+                decoded = self._decode(start)
             for _ in range(self.config.iterations):
                 latent = (start + displacement).requires_grad_()
-                penalty = self._measure(latent, ground, chosen)
+                penalty = self._measure(latent, decoded)
                 if not penalty.requires_grad:  # No scene has an object.
                     break
                 (gradient,) = torch.autograd.grad(penalty.sum(), latent)
@@ -218,28 +221,39 @@ class ConstraintGuidance:
             Penalty (m) of each scene (b,), by name.
         """
         with torch.no_grad():
-            ground, chosen = self._decode(latents)
-            return self._measure_each(latents, ground, chosen)
+            start = self._decode(latents)
+            return self._measure_each(latents, start)[0]
 
-    def _decode(self, latent: Tensor) -> tuple[Ground, tuple[Tensor, Tensor]]:
-        """Return the ground, and scene and proposal of each object that has penalties."""
+    def _decode(self, latent: Tensor) -> _Start:
+        """Return what stays the same during the gradient steps of a guided step."""
         shift, scale = self.moments()
         output = self.lvae.decode(latent * scale + shift)
         chosen = find_objects(
             output.features, output.existence_logit, output.proposals, self.lvae.spec, self.lvae.proposes_duplicates
         )
-        return make_ground(output, self.lvae.spec), chosen
+        existence = output.existence_logit[chosen].float().sigmoid()
+        return _Start(make_ground(output, self.lvae.spec), chosen, existence, output.proposals)
 
-    def _measure_each(self, latent: Tensor, ground: Ground, chosen: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
+    def _measure_each(self, latent: Tensor, start: _Start) -> tuple[dict[str, Tensor], Tensor]:
+        """Return the penalties of latents (m), and squared changes (b,) of existence since the start."""
         shift, scale = self.moments()
-        decoder = self.lvae.object_decoder
         found = self.lvae.decode_objects(self.lvae.split(latent * scale + shift)[1])
-        proposals = decoder.proposals if decoder else (0,) * len(self.lvae.spec.slots)
-        objects = make_objects(found.features, found.existence_logit, proposals, self.lvae.spec, chosen)
-        return compute_penalties(objects, ground, self.names)
+        objects = make_objects(found.features, found.existence_logit, start.proposals, self.lvae.spec, start.chosen)
+        change = (found.existence_logit[start.chosen].float().sigmoid() - start.existence).square()
+        total = change.new_zeros(len(latent)).index_add(0, start.chosen[0], change)
+        return compute_penalties(objects, start.ground, self.names), total
 
-    def _measure(self, latent: Tensor, ground: Ground, chosen: tuple[Tensor, Tensor]) -> Tensor:
-        penalties = self._measure_each(latent, ground, chosen)
+    def _measure(self, latent: Tensor, start: _Start) -> Tensor:
+        penalties, change = self._measure_each(latent, start)
         if not penalties:
             return latent.new_zeros(len(latent))
-        return sum_penalties(penalties, self.config.weights)
+        return sum_penalties(penalties, self.config.weights) + EXISTENCE_M * change
+
+
+class _Start(NamedTuple):
+    """Decoded estimate before the gradient steps: ground, scene and proposal of each object, its existence."""
+
+    ground: Ground
+    chosen: tuple[Tensor, Tensor]
+    existence: Tensor
+    proposals: tuple[int, ...]
