@@ -19,7 +19,7 @@ def test_job_help_describes_job(job):
 
 
 MISTAKES = {
-    ("train_lvae.py", "tiny"): "unknown preset 'tiny', expected one of: smoke, demo, town, kitti360, av2",
+    ("train_lvae.py", "tiny"): "unknown preset 'tiny', expected one of: smoke, demo, town, town-pixels, kitti360, av2",
     ("train_lvae.py",): "run jobs/preprocess_scenes.py",
     ("train_dit.py", "kitti360"): "run jobs/preprocess_scenes.py",
     ("encode_latents.py",): "run jobs/preprocess_scenes.py",
