@@ -159,6 +159,10 @@ class Sheet:
         self.box_label += [label] * len(s)
         self.box_rows.append(rows)
 
+    def find_directions(self, rows: np.ndarray, land: Land) -> np.ndarray:
+        """Return the world directions (n, 2) of the length axes of all boxes, whose rows are joined in `rows`."""
+        return land.direction(rows[:, :2], rows[:, 2:4])
+
 
 def trace_outlines(cells: np.ndarray, s: list[float], t: list[float]) -> list[tuple[int, list[tuple[float, float]]]]:
     """Return the outlines of the patches in a grid of cells.

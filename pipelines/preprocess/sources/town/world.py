@@ -135,7 +135,7 @@ def collect_boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[st
     category = np.array([CATEGORY_INDEX[LABEL_CATEGORY[name]] for name in label], np.int8)
     category[rows[:, 8] > 0] = CATEGORY_INDEX["vegetation_ellipsoid"]
     xy = land.xy(rows[:, :2])
-    along = land.direction(rows[:, :2], rows[:, 2:4])
+    along = sheet.find_directions(rows, land)
     grade = land.grade(xy)
 
     # Low objects follow the slope, and tall objects are upright. A few objects are tilted, as in real annotations.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipelines.preprocess.sources.town.assets import Rect, draw_sizes
-from pipelines.preprocess.sources.town.land import LocalFrame, Sheet
+from pipelines.preprocess.sources.town.land import Land, LocalFrame, Sheet
 from pipelines.preprocess.sources.town.version2.districts import District, Variation
 
 ALIGNED = 0.75  # Share of ellipsoids whose axes are parallel to the street.
@@ -15,6 +16,37 @@ CLUSTER_M = 1.3  # Spread of the plants of a cluster.
 PLANTS_PER_CLUSTER = 2.4
 WALL_LABELS = ("wall", "fence", "gate", "guardrail")
 WALL_SHARES = (0.6, 0.29, 0.09, 0.02)
+
+
+class StreetSheet(Sheet):
+    """Sheet whose boxes keep their angle to the street where streets do not cross at right angles."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.box_yaw_rad: list[np.ndarray] = []  # (n,) angle of each box to the s axis of its frame.
+
+    def boxes(
+        self,
+        frame: LocalFrame,
+        label: str,
+        s: np.ndarray | Sequence[float] | float,
+        t: np.ndarray | Sequence[float] | float,
+        size_m: np.ndarray,
+        yaw_rad: np.ndarray | float = 0.0,
+        bottom_m: np.ndarray | float = 0.0,
+        ellipsoid: bool = False,
+        timestamp: np.ndarray | int = -1,
+        track: np.ndarray | int = -1,
+    ) -> None:
+        """Add n boxes of one label; see `Sheet.boxes`. The angle is measured in the world, not on the board."""
+        super().boxes(frame, label, s, t, size_m, 0.0, bottom_m, ellipsoid, timestamp, track)
+        self.box_yaw_rad.append(np.broadcast_to(np.asarray(yaw_rad, float), len(self.box_rows[-1])))
+
+    def find_directions(self, rows: np.ndarray, land: Land) -> np.ndarray:
+        """Return the world directions (n, 2) of the length axes of all boxes, whose rows are joined in `rows`."""
+        along, yaw = super().find_directions(rows, land), np.concatenate(self.box_yaw_rad)
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        return np.stack([cos * along[:, 0] - sin * along[:, 1], sin * along[:, 0] + cos * along[:, 1]], axis=1)
 
 
 @dataclass(frozen=True)
@@ -110,8 +142,8 @@ def add_wall(site: Site, frame: LocalFrame, s0: float, t0: float, s1: float, t1:
     _add_line(site, frame, (s0, t0, s1, t1), "wall", 5.2, cover)
 
 
-def _add_line(site: Site, frame: LocalFrame, line: Rect, what: str, piece: float, cover: float) -> None:
-    s0, t0, s1, t1 = line
+def _add_line(site: Site, frame: LocalFrame, ends: Rect, what: str, piece: float, cover: float) -> None:
+    s0, t0, s1, t1 = ends
     length, rng = float(np.hypot(s1 - s0, t1 - t0)), site.rng
     if length * cover < 0.8:
         return
@@ -121,14 +153,18 @@ def _add_line(site: Site, frame: LocalFrame, line: Rect, what: str, piece: float
     size[:, 0] = length * cover * share
     start = rng.uniform(0, length * (1 - cover))
     middle = start + np.cumsum(size[:, 0]) - size[:, 0] / 2
-    yaw = float(np.arctan2(t1 - t0, s1 - s0))
-    s, t = s0 + np.cos(yaw) * middle, t0 + np.sin(yaw) * middle
+    ds, dt = (s1 - s0) / length, (t1 - t0) / length
+    (au, av), (iu, iv) = frame.along, frame.inward
+    # The pieces follow the line, also where it is not at a right angle to the street.
+    line = LocalFrame(
+        frame.at(s0, t0).origin, (ds * au + dt * iu, ds * av + dt * iv), (ds * iu - dt * au, ds * iv - dt * av)
+    )
     size[:, 1:] = size[0, 1:] * np.exp(0.06 * rng.standard_normal((count, 2)))
     if what == "hedge":
-        site.sheet.boxes(frame, "vegetation", s, t, size, yaw + rng.normal(0, 0.02, count))
+        site.sheet.boxes(line, "vegetation", middle, 0.0, size, rng.normal(0, 0.02, count))
     else:
         label = WALL_LABELS[int(rng.choice(len(WALL_LABELS), p=WALL_SHARES))]
-        site.sheet.boxes(frame, label, s, t, size, yaw)
+        site.sheet.boxes(line, label, middle, 0.0, size)
 
 
 def add_steps(site: Site, frame: LocalFrame, s: float, t0: float, t1: float, walk_m: float) -> None:
@@ -137,11 +173,11 @@ def add_steps(site: Site, frame: LocalFrame, s: float, t0: float, t1: float, wal
     length = float(np.clip(rng.uniform(2.0, 6.5), 0.9, max(0.9, t1 - t0)))
     t = t1 - length / 2 if rng.random() < 0.4 else t0 + length / 2
     for side in (-1, 1):
-        if rng.random() < 0.36:
+        if rng.random() < 0.3:
             size = draw_sizes(rng, "wall", 1)[0]
             size[0] = length
             site.sheet.boxes(frame, "wall", s + side * (walk_m / 2 + size[1] / 2), t, size, np.pi / 2)
-        if rng.random() < 0.4:
+        if rng.random() < 0.34:
             size = draw_sizes(rng, "wall", 1)[0]
             middle = s + side * (walk_m / 2 + size[0] / 2)
             site.sheet.boxes(frame, "wall", middle, t0 + size[1] / 2, size, 0.0)

@@ -15,7 +15,7 @@ from pipelines.preprocess.sources.town.streets import CityBlock, trace_kerb
 from pipelines.preprocess.sources.town.version2.assets import Site, add_cars, add_ellipsoids, add_patch
 from pipelines.preprocess.sources.town.version2.plots import Kind, build_green, build_row, draw_row
 
-CAR_SLOT_M = 6.2
+CAR_SLOT_M = 6.6
 VERGE_M = (2.2, 3.6)  # Depth of a verge with a path, which takes the place of a sidewalk.
 PATH_M = 1.1  # Width of this path.
 BAY_DEPTH_M = 2.3
@@ -213,7 +213,7 @@ def _park_cars(site: Site, frame: LocalFrame, start: float, end: float, k: int, 
 def _add_furniture(site: Site, frame: LocalFrame, start: float, end: float, k: int, side: Side, corner0: bool) -> None:
     """Add lamps at regular distances, signs near junctions, traffic lights, rows of trees and pedestrians."""
     rng, district, variation = site.rng, site.district, site.variation
-    length, walk = max(0.0, end - start), side.depth
+    length, walk = max(0.0, end - start), side.depth if side.sidewalk else 1.3  # On a verge, poles stand near the road.
     main = side.half_street > 3.9
     # Poles stand at regular distances. The first one stands where the adjacent lane meets a junction. Every other pole
     # is a lamp on one side of a street, or on both sides of a main street.

@@ -27,6 +27,7 @@ NOTHING, TERRAIN, GROUND, PARKING = -1, 0, 1, 2
 CELL_CLASS = ("terrain", "ground", "parking")
 MIN_FRONT_M = 5.0
 MIN_PIECE_M = 0.15
+TURNED = 0.18  # Share of detached houses that are not parallel to the street.
 DETACHED_GARAGES = 0.7  # Share of garages with a gap to the house.
 Kind = Literal["detached", "terrace", "perimeter", "court", "green"]
 COURT_M = (7.5, 13.0)  # Depth of a car park in front of houses.
@@ -151,7 +152,7 @@ def _build_plot(site: Site, frame: LocalFrame, row: Row, plot: Plot) -> None:
     across = row.house_depth * (1.0 if plot.joined else float(np.exp(rng.normal(0, 0.12))))
     walls: Rect = (s0, s0 + plot.front, setback, setback + across)
     height = row.height * float(np.exp(rng.normal(0, 0.03 if plot.joined else 0.12)))
-    _add_building(site, frame, "building", walls, height, 0.0 if plot.joined else float(rng.normal(0, 0.04)))
+    _add_building(site, frame, "building", walls, height, 0.0 if plot.joined else _draw_turn(rng))
     painted: list[tuple[int, Rect]] = [] if row.below else [(NOTHING, walls)]
     taken: list[Rect] = [walls]
     open_front: list[tuple[float, float]] = []
@@ -200,6 +201,11 @@ def _build_plot(site: Site, frame: LocalFrame, row: Row, plot: Plot) -> None:
     _add_borders(site, frame, row, plot.width, setback, open_front, court)
     plant_garden(site, frame, plot.width, min(row.depth, setback + across + 4.0), taken)
     _add_belongings(site, frame, walls, open_front)
+
+
+def _draw_turn(rng: np.random.Generator) -> float:
+    """Return the angle of a detached house to the street; a few houses are turned away from it."""
+    return float(rng.normal(0, 0.28 if rng.random() < TURNED else 0.03))
 
 
 def _add_building(site: Site, frame: LocalFrame, label: str, walls: Rect, height: float, turn_rad: float) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES
 from pipelines.preprocess.sources.drive import Drive, SlabGround
 from pipelines.preprocess.sources.town.districts import TOWN_KINDS
-from pipelines.preprocess.sources.town.land import Land, Sheet, draw_land
+from pipelines.preprocess.sources.town.land import Land, draw_land
 from pipelines.preprocess.sources.town.streets import (
     CityBlock,
     Streets,
@@ -22,7 +22,7 @@ from pipelines.preprocess.sources.town.streets import (
     pave_streets,
     plan_route,
 )
-from pipelines.preprocess.sources.town.version2.assets import Site
+from pipelines.preprocess.sources.town.version2.assets import Site, StreetSheet
 from pipelines.preprocess.sources.town.version2.blocks import furnish_block
 from pipelines.preprocess.sources.town.version2.districts import DISTRICTS, Variation, draw_variation
 from pipelines.preprocess.sources.town.version2.footprints import compute_corners, find_covered, separate_buildings
@@ -37,11 +37,11 @@ from pipelines.preprocess.sources.town.world import (
     sample_poses,
 )
 
-SPACING_M = {"centre": (48, 66), "suburb": (48, 66), "green": (58, 90)}
+SPACING_M = {"centre": (46, 63), "suburb": (48, 66), "green": (58, 90)}
 OUTSKIRTS_M = 48.0
 MISSING = 0.2  # Share of inner streets that are omitted. Their ends become T-junctions.
 # Share and range of the half width of each class of streets.
-STREET_CLASSES = (("residential", 0.54, (2.35, 2.85)), ("collector", 0.32, (3.0, 3.7)), ("main", 0.14, (4.0, 5.0)))
+STREET_CLASSES = (("residential", 0.5, (2.4, 2.9)), ("collector", 0.34, (3.0, 3.7)), ("main", 0.16, (4.0, 5.0)))
 CORNER_M = (3.5, 7.5)  # Radius of kerbs.
 SKEWED = 0.7  # Share of towns whose streets do not cross at right angles.
 MAX_SKEW = 0.3  # Largest tangent of the deviation from a right angle.
@@ -75,7 +75,7 @@ def make_town(seed: int, num_free_poses: int = 0) -> Drive:
     streets = _widen_streets(rng, streets)
     border = streets.u_m[split]
 
-    sheet = Sheet()
+    sheet = StreetSheet()
     pave_streets(streets, sheet)
     of_town = np.exp(rng.normal(0, [0.0, 0.08, 0.08, 0.08, 0.04, 0.08, 0.1, 0.1, 0.1, 0.15, 0.15]))
     for block in list_blocks(streets, cells, lambda u, v: main if u < border else edge, OUTSKIRTS_M):
