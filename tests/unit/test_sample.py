@@ -35,7 +35,7 @@ def test_sampler_repairs_sampled_scenes(tmp_path):
     from pipelines.metrics.validity import find_faults
 
     request = SampleRequest(
-        find_pipeline_directory("town"), str(tmp_path), "plain", 4, ("low", "high"), 0, 10, 1.0, "dpm++"
+        find_pipeline_directory("town"), str(tmp_path), "plain", 16, ("low", "high"), 0, 10, 1.0, "dpm++"
     )
     scenes, number = [], []
     for one in (request, replace(request, run="repaired", repair=True)):
