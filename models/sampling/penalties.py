@@ -56,8 +56,8 @@ PENETRATION_TOLERANCE_M = 0.1  # Rounding of the town's tables and of the decode
 
 # Largest depth below and height above the ground (m) that has no penalty. Source: 1 % and 99 % of the gaps in 256 test
 # scenes of the town, rounded up to multiples of 0.05 m. Only a centre on annotated ground counts. No building of these
-# scenes has such a centre: the bottom of buildings lies up to 0.8 m below the highest ground within 2 m, and up to 1.1
-# m below it in other scenes of the town, because buildings are sunk on slopes.
+# scenes has such a centre. Buildings are sunk on slopes: their bottoms lie up to 0.8 m below the highest ground within
+# 2 m of the footprint, and the tolerance leaves a margin for steeper slopes.
 HEIGHT_TOLERANCE_M = {
     "vehicle_big": (0.15, 0.05),
     "vehicle_small": (0.1, 0.05),

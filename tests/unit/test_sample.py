@@ -34,10 +34,12 @@ def test_sampler_repairs_sampled_scenes(tmp_path):
     from pipelines.generation.sample import Sampler, SampleRequest
     from pipelines.metrics.validity import find_faults
 
-    request = SampleRequest(find_pipeline_directory("town"), str(tmp_path), "plain", 8, ("high",), 0, 10, 1.0, "dpm++")
+    request = SampleRequest(
+        find_pipeline_directory("town"), str(tmp_path), "plain", 16, ("low", "high"), 0, 10, 1.0, "dpm++"
+    )
     scenes, number = [], []
     for one in (request, replace(request, run="repaired", repair=True)):
-        Sampler(one, batch_size=8)({"id": 0})
+        Sampler(one, batch_size=4)({"id": 0})
         made = list(read_scenes(str(tmp_path), source=one.source))
         found = [find_faults(scene, SLAB_OFFSET_M) for scene in made]
         scenes.append(made)
