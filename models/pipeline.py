@@ -426,7 +426,7 @@ class PrITTIPipeline:
         identities: Sequence[Scene],
         existence_threshold: float | None = None,
         deduplicate: bool = True,
-        attach: bool = True,
+        attach: bool | None = None,
         raster_px: int | None = None,
     ) -> list[Scene]:
         """Decode latents to scenes.
@@ -442,7 +442,8 @@ class PrITTIPipeline:
             deduplicate: A cell decoder may propose the same object in two cells. If True, only the proposal with the
                 higher existence probability is kept.
             attach: Whether signs are attached to poles, walls and buildings, and poles are put on the ground
-                (models/composition/attachments.py). `attachments` counts the changes. The paper does not do this.
+                (models/composition/attachments.py). `attachments` counts the changes. The paper does not do this, so
+                None means no for pipelines of the paper's presets (`neighbour_latents` is "paper"), and yes for others.
             raster_px: Number of rows and of columns of the rasters; None: that of the model's grid. Only models whose
                 ground consists of level sets decode another resolution.
 
@@ -457,6 +458,7 @@ class PrITTIPipeline:
         shift, scale = self._moments()
         if not torch.isfinite(latents).all():  # Decoded, such a latent would give an empty scene.
             raise ValueError("a latent holds NaN or infinity: the weights of the model are damaged")
+        attach = self.config.neighbour_latents != "paper" if attach is None else attach
         spec, parts = self.spec, latents.split(self.execution.decode_batch_size)
         if raster_px is not None:
             require_within("raster_pixels", raster_px**2 * len(spec.ground_classes), "raster_px")
