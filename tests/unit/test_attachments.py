@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from helpers import random_scene, scenes_equal, small_spec, tiny_pipeline
 
 from models.composition.attachments import (
@@ -193,17 +192,6 @@ def test_pipeline_attaches_by_default():
         for scenes in (plain, attached)
     ]
     assert report.lowered > 0 and report.moved > 0 and hanging[1] < 0.5 * hanging[0]
-
-
-def test_pipelines_of_paper_presets_attach_nothing():
-    pipeline = tiny_pipeline(small_spec())
-    latents = torch.randn(2, *pipeline.latent_shape, generator=torch.Generator().manual_seed(0))
-    identities = [pipeline.new_identity("run", 0, k, "low") for k in range(2)]
-    kept = pipeline.decode(latents, identities, 0.01, attach=False)
-    pipeline.register_to_config(neighbour_latents="paper")
-    for first, second in zip(kept, pipeline.decode(latents, identities, 0.01), strict=True):
-        assert np.array_equal(first.center_m, second.center_m)
-    assert pipeline.attachments == AttachmentReport()
-    pipeline.register_to_config(neighbour_latents="reencode")
-    pipeline.decode(latents, identities, 0.01)
-    assert pipeline.attachments != AttachmentReport()
+    pipeline.register_to_config(neighbour_latents="paper")  # As the paper's presets, which attach nothing.
+    for before, after in zip(plain, pipeline.decode(latents, identities), strict=True):
+        assert scenes_equal(before, after)
