@@ -13,7 +13,7 @@ from pipelines.preprocess.sources.town.assets import draw_sizes, plant_strip
 from pipelines.preprocess.sources.town.land import LocalFrame
 from pipelines.preprocess.sources.town.streets import CityBlock, trace_kerb
 from pipelines.preprocess.sources.town.version2.assets import Site, add_cars, add_ellipsoids, add_patch
-from pipelines.preprocess.sources.town.version2.plots import Kind, build_green, build_row, draw_row
+from pipelines.preprocess.sources.town.version2.plots import MIN_PIECE_M, Kind, build_green, build_row, draw_row
 
 CAR_SLOT_M = 6.6
 VERGE_M = (2.2, 3.6)  # Depth of a verge with a path, which takes the place of a sidewalk.
@@ -166,7 +166,7 @@ def _build_corner(
 def _build_bays(site: Site, frame: LocalFrame, start: float, end: float, paved: str) -> None:
     """Build parking bays along the road, with trees between groups of bays."""
     rng, s = site.rng, start
-    while s < end:
+    while s < end - MIN_PIECE_M:
         run = min(end - s, CAR_SLOT_M * int(rng.integers(2, 5)))
         if end - s - run < 5:
             run = end - s
@@ -178,7 +178,7 @@ def _build_bays(site: Site, frame: LocalFrame, start: float, end: float, paved: 
             add_cars(site, frame, at[taken], 1.15, np.pi)
             s += run
         gap = min(end - s, float(rng.uniform(2.0, 3.0)))
-        if gap > 0:
+        if gap > MIN_PIECE_M:
             site.sheet.slab(frame, paved, [(s, 0), (s + gap, 0), (s + gap, BAY_DEPTH_M), (s, BAY_DEPTH_M)])
             if rng.random() < 0.5:
                 add_ellipsoids(site, frame, np.array([s + gap / 2]), np.array([1.1]), "tree")

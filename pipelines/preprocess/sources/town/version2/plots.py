@@ -30,7 +30,7 @@ MIN_PIECE_M = 0.15
 TURNED = 0.18  # Share of detached houses that are not parallel to the street.
 DETACHED_GARAGES = 0.7  # Share of garages with a gap to the house.
 Kind = Literal["detached", "terrace", "perimeter", "court", "green"]
-COURT_M = (7.5, 13.0)  # Depth of a car park in front of houses.
+COURT_M = (7.0, 12.0)  # Depth of a car park in front of houses.
 
 
 @dataclass(frozen=True)

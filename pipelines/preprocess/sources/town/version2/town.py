@@ -37,11 +37,11 @@ from pipelines.preprocess.sources.town.world import (
     sample_poses,
 )
 
-SPACING_M = {"centre": (46, 63), "suburb": (48, 66), "green": (58, 90)}
+SPACING_M = {"centre": (45, 61), "suburb": (48, 66), "green": (58, 90)}
 OUTSKIRTS_M = 48.0
 MISSING = 0.2  # Share of inner streets that are omitted. Their ends become T-junctions.
 # Share and range of the half width of each class of streets.
-STREET_CLASSES = (("residential", 0.5, (2.4, 2.9)), ("collector", 0.34, (3.0, 3.7)), ("main", 0.16, (4.0, 5.0)))
+STREET_CLASSES = (("residential", 0.51, (2.4, 2.9)), ("collector", 0.33, (3.0, 3.7)), ("main", 0.16, (4.0, 5.0)))
 CORNER_M = (3.5, 7.5)  # Radius of kerbs.
 SKEWED = 0.7  # Share of towns whose streets do not cross at right angles.
 MAX_SKEW = 0.3  # Largest tangent of the deviation from a right angle.
