@@ -29,7 +29,7 @@ from scipy.stats import wasserstein_distance
 from models.layout import SLAB_OFFSET_M
 from models.scene import CATEGORY_INDEX, Scene
 from pipelines.io.mesh_import import import_glb
-from pipelines.metrics.controls import CONTROLS, damage_scene
+from pipelines.metrics.controls import damage_scene
 from pipelines.metrics.relations import GROUND_CLASSES, RELATIONS, compute_scene_relations
 from pipelines.preprocess.sources.town.generator import TOWN_VERSIONS, generate_town, select_poses
 from pipelines.schema.tables import read_scenes
@@ -184,6 +184,13 @@ def compare_pair(first: np.ndarray, last: np.ndarray) -> str:
     )
 
 
+def report_nearer(distances: dict[str, np.ndarray], config: Config) -> None:
+    """Print the comparison of the last version with the first one, if there are two."""
+    if len(distances) > 1:
+        first, last = (f"town {config.version[k]}" for k in (0, -1))
+        print(f"{last} against {first}: {compare_pair(distances[first], distances[last])}")
+
+
 def print_table(reference: np.ndarray, columns: dict[str, np.ndarray], distances: dict[str, np.ndarray]) -> None:
     """Print one row per quantity: the mean of each set of scenes, then the distances."""
     heads = [f"distance {name}" for name in distances]
@@ -215,20 +222,14 @@ def main(config: Config) -> None:
     extra = {"ceiling": compute_distances(other, reference, spread)}
     extra |= {"control": compute_distances(control, reference, spread)}
     print_table(reference, columns, distances | extra)
-    first_version, *_, last_version = [*distances.values(), *distances.values()]
-    if len(distances) > 1:
-        print(
-            f"town {config.version[-1]} against town {config.version[0]}: {compare_pair(first_version, last_version)}"
-        )
+    report_nearer(distances, config)
     if config.glb:
         published = measure_scenes(import_glb(path) for path in config.glb)
         distances = {name: compute_distances(values, published, spread) for name, values in columns.items()}
         print(f"\n{len(published)} scenes from GLB files; unit: standard deviation over the scenes of KITTI-360")
         print_table(published, columns, distances)
-        if len(distances) > 1:
-            print(compare_pair(distances[f"town {config.version[0]}"], distances[f"town {config.version[-1]}"]))
+        report_nearer(distances, config)
 
 
 if __name__ == "__main__":
-    assert set(NAMES) <= set(MEASURES) and set(CONTROLS)
     main(tyro.cli(Config, description=__doc__))

@@ -73,14 +73,14 @@ def plan_town(
         The tasks.
     """
     parts = generator.plan_town_parts(num_train, num_test, seed)
-    plan: list[tuple[str, ShardPart]] = []
-    done: dict[str, int] = {TRAIN: 0, TEST: 0}
+    plan: list[tuple[str, tuple[ShardPart, ...]]] = []
+    done: dict[str, int] = dict.fromkeys((TRAIN, TEST), 0)
     for town_seed, split, count in parts:
         # Rounding the cumulative number makes the share exact in each split.
         num_free = round((done[split] + count) * free_pose_share) - round(done[split] * free_pose_share)
         done[split] += count
-        plan.append((split, ShardPart((town_seed, count, version, num_free), f"{town_seed:05d}")))
-    return _number_tasks("town", [(split, (part,)) for split, part in plan])
+        plan.append((split, (ShardPart((town_seed, count, version, num_free), f"{town_seed:05d}"),)))
+    return _number_tasks("town", plan)
 
 
 def plan_kitti360(root: str, split: bool = True, skip_unreadable: bool = False) -> list[ShardTask]:

@@ -3,9 +3,13 @@
 import hashlib
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import shapely
 
+from jobs.implementation.checks import check_preprocess_scenes
+from jobs.implementation.preprocess_scenes import make_recorded_options, plan_shards
+from jobs.preprocess_scenes import Town
 from models.layout import SLAB_OFFSET_M
 from models.scene import CATEGORY_INDEX
 from pipelines.metrics.relations import RELATIONS, compute_scene_relations, find_support, fuse_ground, measure_objects
@@ -25,6 +29,7 @@ from pipelines.preprocess.sources.town.version2.footprints import (
     separate_buildings,
 )
 from pipelines.preprocess.sources.town.version2.town import invert_land
+from pipelines.schema.tables import SCENES, Shard
 
 BUILDING = CATEGORY_INDEX["construction_big"]
 # Digest of the towns of version 1 with these seeds. A change of these values changes the data of released weights.
@@ -190,6 +195,46 @@ def test_select_town_poses_takes_all_free_poses():
     assert select_town_poses(110, 15, 10).tolist() == [*select_poses(100, 5).tolist(), *range(100, 110)]
     with pytest.raises(ValueError, match="8 scenes"):
         select_town_poses(10, 13, 5)
+
+
+def test_free_pose_column_round_trips(towns, tmp_path):
+    drive = towns[3]
+    scenes = [drive.scene(k) for k in (0, len(drive) - 1)]
+    shard = Shard(str(tmp_path), "town", "train", 0)
+    shard.write(scenes)
+    assert [scene.free_pose for scene in shard.scenes()] == [False, True]
+    assert shard.read("scenes", ["free_pose"])["free_pose"].to_pylist() == [False, True]
+    # Files of earlier versions lack the column; all their scenes are views of a vehicle.
+    old = pq.read_table(shard.path("scenes")).drop_columns(["free_pose"])
+    pq.write_table(old, shard.path("scenes"))
+    assert [scene.free_pose for scene in shard.scenes()] == [False, False]
+    assert shard.read("scenes").schema.names == SCENES.names
+
+
+def test_town_job_records_version_and_share():
+    old = make_recorded_options(Town(num_train=5))
+    assert old["town_version"] == 1 and "free_pose_share" not in old
+    new = make_recorded_options(Town(num_train=5, town_version=2))
+    assert (new["town_version"], new["free_pose_share"]) == (2, 0.25)
+    assert make_recorded_options(Town(town_version=2, free_pose_share=0.0))["free_pose_share"] == 0.0
+    keys = [part.key for task in plan_shards(Town(num_train=40, num_test=0, town_version=2)) for part in task.parts]
+    assert {version for _, _, version, _ in keys} == {2} and sum(free for *_, free in keys) == 10
+
+
+def test_town_job_refuses_wrong_share():
+    with pytest.raises(ValueError, match=r"--free-pose-share is 1\.5, expected a share between 0 and 1"):
+        check_preprocess_scenes(Town(town_version=2, free_pose_share=1.5))
+    with pytest.raises(ValueError, match="add --town-version 2"):
+        check_preprocess_scenes(Town(free_pose_share=0.5))
+    check_preprocess_scenes(Town(free_pose_share=0.0))
+
+
+@pytest.mark.parametrize("seed", range(40, 52))
+def test_version_2_outlines_are_simple(seed):
+    """Making the ground of a town raises an error if an outline crosses itself or has no area."""
+    ground = generate_town(seed, 2).ground
+    tops = outline_slabs(generate_town(seed, 2), ("parking", "terrain"))
+    assert len(ground.slab_class) > 300 and all(top.is_valid and top.area > 0.01 for top in tops)
 
 
 def test_invert_land_returns_board_points():

@@ -3,8 +3,8 @@
     drive = generate_town(7)       # one town and one drive through its streets
     scene = drive.scene(0)         # the scene ahead of the first pose
 
-The module depends only on numpy. The same seed and numpy version give the same town. TOWN_VERSION increases with every
-change of the output.
+The module depends only on numpy. The same seed, version and numpy version give the same town. Version 2
+(town/version2) is nearer to real streets. A change of the output of a version needs a new version.
 """
 
 from __future__ import annotations

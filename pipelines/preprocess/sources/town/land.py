@@ -109,6 +109,8 @@ class LocalFrame:
 class Sheet:
     """Slabs and boxes of a town in board coordinates, before `Land` maps them to the world frame."""
 
+    upright = ("building", "garage", "car", "truck", "bus")  # Labels of boxes that are never tilted at random.
+
     def __init__(self) -> None:
         self.slabs: list[tuple[str, np.ndarray]] = []  # ground class and outline (n, 2), clockwise or counter-clockwise
         self.box_label: list[str] = []

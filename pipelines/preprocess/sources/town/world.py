@@ -142,7 +142,7 @@ def collect_boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[st
     leans = np.isin(label, ["car", "truck", "bus", "bicycle", "motorcycle", "wall", "fence", "gate", "guardrail"])
     leans |= np.isin(category, CATEGORY_INDEX["vegetation_cuboid"])
     tilt = np.where(leans[:, None], -grade, 0.0)
-    careless = (rng.random(len(label)) < 0.015) & ~np.isin(label, ["building", "garage", "car", "truck", "bus"])
+    careless = (rng.random(len(label)) < 0.015) & ~np.isin(label, sheet.upright)
     tilt[careless] += rng.normal(0, 0.1, (careless.sum(), 2)).clip(-0.24, 0.24)
     normal = np.column_stack([tilt, np.ones(len(label))])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

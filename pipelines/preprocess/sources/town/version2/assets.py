@@ -21,6 +21,9 @@ WALL_SHARES = (0.6, 0.29, 0.09, 0.02)
 class StreetSheet(Sheet):
     """Sheet whose boxes keep their angle to the street where streets do not cross at right angles."""
 
+    # A tilted pole would not touch its lamp or sign.
+    upright = (*Sheet.upright, "smallPole", "bigPole", "lamp", "trafficSign", "trafficLight", "bicycle", "motorcycle")
+
     def __init__(self) -> None:
         super().__init__()
         self.box_yaw_rad: list[np.ndarray] = []  # (n,) angle of each box to the s axis of its frame.
