@@ -64,6 +64,7 @@ INDEX_RULES: dict[str, Rule] = {
     "existence_threshold": Number(0, 1),
     "neighbour_latents": Choice(NEIGHBOUR_LATENTS),
     "constraints": Flag(),
+    "attach": Flag(),
 }
 
 
@@ -131,6 +132,8 @@ class PrITTIPipeline:
         neighbour_latents: How outpainting uses neighbouring blocks by default: "reencode", "copy" or "paper"
             (jobs/outpaint_scenes.py).
         constraints: Whether constraints guide sampling by default (models/sampling/constraints.py). The paper has none.
+        attach: Whether decoding attaches signs and poles by default (models/composition/attachments.py). The paper does
+            not do this.
 
     Raises:
         ValueError: The LayoutSpec or the shape of the latents of the DiT differs from that of `lvae`, or the noise
@@ -146,6 +149,7 @@ class PrITTIPipeline:
         existence_threshold: float = EXISTENCE_THRESHOLD,
         neighbour_latents: str = "reencode",
         constraints: bool = False,
+        attach: bool = True,
     ) -> None:
         self.lvae, self.dit = lvae.eval().requires_grad_(False), dit.eval().requires_grad_(False)
         self.scheduler = SchedulerConfig.ddpm(dit.diffusion)
@@ -156,6 +160,7 @@ class PrITTIPipeline:
             existence_threshold=existence_threshold,
             neighbour_latents=neighbour_latents,
             constraints=constraints,
+            attach=attach,
         )
         self.execution = SamplingExecution()
         # What the last denoiser depends on, its labels, and the denoiser.
@@ -202,7 +207,7 @@ class PrITTIPipeline:
         except ValueError as error:
             raise ValueError(f"{path / SCHEDULER_CONFIG}: {error}") from error
         components = {name: kind.from_pretrained(path / name, torch_dtype) for name, kind in COMPONENTS.items()}
-        names = ("noise_scaling", "existence_threshold", "neighbour_latents", "constraints")
+        names = ("noise_scaling", "existence_threshold", "neighbour_latents", "constraints", "attach")
         thresholds = {name: index[name] for name in names if name in index}
         try:
             return cls(**components, scheduler=scheduler, **thresholds)
@@ -282,7 +287,7 @@ class PrITTIPipeline:
         self.scheduler_config.require_schedule(self.dit.diffusion)
 
     def register_to_config(self, **changes: Any) -> None:
-        """Replace `noise_scaling`, `existence_threshold`, `neighbour_latents` or `constraints`.
+        """Replace `noise_scaling`, `existence_threshold`, `neighbour_latents`, `constraints` or `attach`.
 
         Args:
             **changes: New values by name.
@@ -442,8 +447,8 @@ class PrITTIPipeline:
             deduplicate: A cell decoder may propose the same object in two cells. If True, only the proposal with the
                 higher existence probability is kept.
             attach: Whether signs are attached to poles, walls and buildings, and poles are put on the ground
-                (models/composition/attachments.py). `attachments` counts the changes. The paper does not do this, so
-                None means no for pipelines of the paper's presets (`neighbour_latents` is "paper"), and yes for others.
+                (models/composition/attachments.py); None: the default of the pipeline. `attachments` counts the
+                changes.
             raster_px: Number of rows and of columns of the rasters; None: that of the model's grid. Only models whose
                 ground consists of level sets decode another resolution.
 
@@ -458,7 +463,7 @@ class PrITTIPipeline:
         shift, scale = self._moments()
         if not torch.isfinite(latents).all():  # Decoded, such a latent would give an empty scene.
             raise ValueError("a latent holds NaN or infinity: the weights of the model are damaged")
-        attach = self.config.neighbour_latents != "paper" if attach is None else attach
+        attach = self.config.attach if attach is None else attach
         spec, parts = self.spec, latents.split(self.execution.decode_batch_size)
         if raster_px is not None:
             require_within("raster_pixels", raster_px**2 * len(spec.ground_classes), "raster_px")

@@ -135,6 +135,8 @@ class DiTPreset:
             probability; DiT uses 0.1.
         neighbour_latents: How outpainting with the trained pipeline uses neighbouring blocks by default; "paper": as in
             the paper (jobs/outpaint_scenes.py).
+        attach: Whether decoding attaches signs and poles (models/composition/attachments.py). The paper does not do
+            this.
     """
 
     lvae: str
@@ -148,6 +150,7 @@ class DiTPreset:
     ema_decay: float | None = 0.9999
     label_dropout: float = 0.1
     neighbour_latents: str = "reencode"
+    attach: bool = True
 
     def architecture(self) -> dict:
         """Return all keyword arguments of `DiT` except those that depend on the latents."""
@@ -155,7 +158,7 @@ class DiTPreset:
 
 
 SMALL_DIT = DiTConfig(2, 6, 256, 4, prediction="v_prediction")
-PAPER_OUTPAINTING: dict[str, Any] = {"neighbour_latents": "paper"}
+PAPER_DECODING: dict[str, Any] = {"neighbour_latents": "paper", "attach": False}
 TOWN_TRAINING: dict[str, Any] = {"normalise_latents": True, "learning_rate": 1e-3, "ema_decay": 0.999}
 
 # fmt: off
@@ -165,13 +168,13 @@ DIT_PRESETS: dict[str, DiTPreset] = {
     "demo":        DiTPreset("demo",     SMALL_DIT,                  16,  30_000, **TOWN_TRAINING),
     "town":        DiTPreset("town",     SMALL_DIT,                  16,  30_000, **TOWN_TRAINING),
     "kitti360-mini": DiTPreset("kitti360-mini", DiTConfig(2, 4, 128, 4), 16, 3_000, learning_rate=1e-3,
-                               ema_decay=0.999, **PAPER_OUTPAINTING),
+                               ema_decay=0.999, **PAPER_DECODING),
     # The paper reports three days of training on four A100s but not the number of steps. It trains all sizes with the
     # same total compute, here the same number of floating-point operations as the 400,000 steps of DiT-B.
-    "kitti360":    DiTPreset("kitti360", DiTConfig(2, 12, 768, 12),  256, 400_000, **PAPER_OUTPAINTING),
-    "kitti360-l":  DiTPreset("kitti360", DiTConfig(2, 24, 1024, 16), 256, 114_300, **PAPER_OUTPAINTING),
-    "kitti360-xl": DiTPreset("kitti360", DiTConfig(2, 28, 1152, 16), 256, 77_800, **PAPER_OUTPAINTING),
-    "av2":         DiTPreset("av2",      DiTConfig(2, 12, 768, 12),  256, 400_000, **PAPER_OUTPAINTING),
+    "kitti360":    DiTPreset("kitti360", DiTConfig(2, 12, 768, 12),  256, 400_000, **PAPER_DECODING),
+    "kitti360-l":  DiTPreset("kitti360", DiTConfig(2, 24, 1024, 16), 256, 114_300, **PAPER_DECODING),
+    "kitti360-xl": DiTPreset("kitti360", DiTConfig(2, 28, 1152, 16), 256, 77_800, **PAPER_DECODING),
+    "av2":         DiTPreset("av2",      DiTConfig(2, 12, 768, 12),  256, 400_000, **PAPER_DECODING),
 }
 # fmt: on
 

@@ -87,13 +87,13 @@ class Grid:
         """Return the y coordinates (cols,) of the pixel centres in metres."""
         return self.left_m - (np.arange(self.cols) + 0.5) * self.resolution_m
 
-    def contains(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> Any:
+    def contains(self, x_m: Any, y_m: Any) -> Any:
         """Test whether points lie inside the rectangle of the grid.
 
         The front border and the left border belong to the rectangle; the other two borders do not.
 
         Args:
-            x_m: x coordinates (metres, scene frame).
+            x_m: x coordinates (metres, scene frame), as a number, an array or a tensor.
             y_m: y coordinates (metres, scene frame).
 
         Returns:

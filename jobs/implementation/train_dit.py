@@ -97,7 +97,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
         log_every=max(1, min(50, settings.steps // 50)),
         validate=SamplingCheck(root, dataset.source, latents_root, latents["lvae"], label_kind),
     )
-    sampling = (start.sampling if start else {}) | {"neighbour_latents": row.neighbour_latents}
+    sampling = (start.sampling if start else {}) | {"neighbour_latents": row.neighbour_latents, "attach": row.attach}
     return training, partial(complete_pipeline, latents["lvae"], sampling)
 
 
@@ -278,7 +278,7 @@ def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
 
     Args:
         lvae: Directory of the layout VAE.
-        sampling: Values of `noise_scaling`, `existence_threshold`, `neighbour_latents`, `constraints`.
+        sampling: Values of `noise_scaling`, `existence_threshold`, `neighbour_latents`, `constraints`, `attach`.
         output: Directory that contains dit/. This directory is also returned.
     """
     dit = DiT.from_pretrained(storage.join_uri(output, "dit"))

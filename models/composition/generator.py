@@ -44,7 +44,7 @@ class SceneGenerator(Protocol):
         ...
 
     def decode(
-        self, latents: Tensor, identities: Sequence[Scene], *, deduplicate: bool = True, attach: bool = True
+        self, latents: Tensor, identities: Sequence[Scene], *, deduplicate: bool = True, attach: bool | None = None
     ) -> list[Scene]:
         """Decode latents to scenes.
 
@@ -52,7 +52,8 @@ class SceneGenerator(Protocol):
             latents: (b, c, h, w) latents.
             identities: Scenes whose ids and labels are copied to the results.
             deduplicate: If True, keep only one of several proposals for the same object.
-            attach: Whether signs are attached to their supporters, and poles are put on the ground.
+            attach: Whether signs are attached to their supporters, and poles are put on the ground; None: the
+                default of the model.
 
         Returns:
             One scene per latent.

@@ -452,7 +452,7 @@ def generate_blocks(
         OUTPAINT,
     )
     as_paper = mode == "paper"
-    scenes = model.decode(latents, [empty] * len(indices), deduplicate=not as_paper, attach=not as_paper)
+    scenes = model.decode(latents, [empty] * len(indices), deduplicate=not as_paper, attach=False if as_paper else None)
     parts = zip(indices, conditions, latents, scenes, strict=True)
     return {
         index: composer.finish_block(condition, latent, scene, blend=not as_paper)

@@ -153,7 +153,7 @@ class Ground:
 
     @cached_property
     def forbidden(self) -> tuple[Tensor, Tensor]:
-        """Probabilities of road and of sidewalk beside the road, both (b, 2, rows, cols): sharp, then blurred."""
+        """Probabilities of road and of sidewalk outside the road, both (b, 2, rows, cols): sharp, then blurred."""
         maps = torch.stack([self.road, self.find_classes(("sidewalk",)) * (1 - self.road)], dim=1)
         return maps, _blur(maps, self.spec.grid.resolution_m)
 
@@ -176,6 +176,17 @@ class Ground:
         """
         index = [k for k, name in enumerate(self.spec.ground_classes) if name in names]
         return self.probability[:, index].amax(dim=1) if index else torch.zeros_like(self.probability[:, 0])
+
+    def contains(self, xy_m: Float[Tensor, "*points 2"]) -> Bool[Tensor, "*points"]:
+        """Test whether points lie inside the grid.
+
+        Args:
+            xy_m: Points (m, scene frame).
+
+        Returns:
+            Booleans.
+        """
+        return self.spec.grid.contains(*xy_m.unbind(dim=-1))
 
     def sample(self, maps: Float[Tensor, "b k rows cols"], scene: Tensor, xy_m: Tensor) -> Tensor:
         """Interpolate maps bilinearly.
@@ -454,7 +465,7 @@ def compute_footprint(objects: Objects, ground: Ground) -> Float[Tensor, " scene
     shares = torch.outer(share, share).flatten() / share.sum() ** 2
     sides_m = some.axes[:, :2, :2] * some.size_m[:, None, :2]
     xy_m = some.center_m[:, None, :2] + torch.einsum("nij,pj->npi", sides_m, points)
-    inside = _contains(ground.spec, xy_m.detach())
+    inside = ground.contains(xy_m.detach())
     # The probability is a step, so its gradient is zero except at the border. The gradient is that of blurred maps.
     maps, blurred = ground.forbidden
     sharp = ground.sample(maps, some.scene, xy_m.detach()) * inside[:, None]
@@ -489,7 +500,7 @@ def compute_height(objects: Objects, ground: Ground) -> Float[Tensor, " scenes"]
     allowed = {CATEGORY_INDEX[name]: both for name, both in HEIGHT_TOLERANCE_M.items()}
     some = objects.take(objects.is_any(tuple(allowed)))
     surface_m = ground.find_surface(some.scene, some.center_m[:, :2].detach())
-    known = torch.isfinite(surface_m) & _contains(ground.spec, some.center_m[:, :2].detach())
+    known = torch.isfinite(surface_m) & ground.contains(some.center_m[:, :2].detach())
     reach_m = (some.axes[:, 2].abs() * some.size_m).sum(dim=1) / 2
     gap_m = some.center_m[:, 2] - reach_m - surface_m.nan_to_num()
     limits_m = torch.tensor([allowed.get(k, (0.0, 0.0)) for k in range(len(CATEGORIES))], device=gap_m.device)
@@ -559,12 +570,12 @@ def _measure_lanes(ground: Ground, objects: Objects) -> tuple[Tensor, Tensor, Te
     offset_m = torch.cartesian_prod(unit, unit)
     xy_m = center_m[:, None] + offset_m
     found = ground.sample(ground.slopes, objects.scene, xy_m)
-    weight = torch.exp(-0.5 * (offset_m / LANE_SPREAD_M).square().sum(dim=1)) * _contains(ground.spec, xy_m)
+    weight = torch.exp(-0.5 * (offset_m / LANE_SPREAD_M).square().sum(dim=1)) * ground.contains(xy_m)
     across_cos, across_sin, trace = (found * weight[:, None]).sum(dim=2).unbind(dim=1)
     length = torch.hypot(across_cos, across_sin)
     along = -torch.stack([across_cos, across_sin], dim=1) / length.clamp(min=1e-9)[:, None]
     road = ground.sample(ground.road[:, None], objects.scene, center_m[:, None])[:, 0, 0]
-    return along, length / trace.clamp(min=1e-3), (road > 0.5) & _contains(ground.spec, center_m)
+    return along, length / trace.clamp(min=1e-3), (road > 0.5) & ground.contains(center_m)
 
 
 def compute_penalties(objects: Objects, ground: Ground, names: Sequence[str]) -> dict[str, Float[Tensor, " scenes"]]:
@@ -652,12 +663,6 @@ def _measure_reach(normals: Float[Tensor, "n k d"], box: Objects, d: int) -> Flo
 
 def _normalise(vectors: Float[Tensor, "n k d"]) -> Float[Tensor, "n k d"]:
     return vectors / vectors.detach().norm(dim=2, keepdim=True).clamp(min=1e-9)
-
-
-def _contains(spec: LayoutSpec, xy_m: Tensor) -> Tensor:
-    """Return which points (..., 2) lie inside the grid."""
-    grid, (x_m, y_m) = spec.grid, xy_m.unbind(dim=-1)
-    return (x_m > grid.back_m) & (x_m <= grid.front_m) & (y_m > grid.right_m) & (y_m <= grid.left_m)
 
 
 def _sum_scenes(values: Float[Tensor, " n"], scene: Int[Tensor, " n"], scenes: int) -> Float[Tensor, " scenes"]:

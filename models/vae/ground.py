@@ -159,14 +159,38 @@ def init_from_data(
     unit = torch.cat(
         [heights, min(error, key=lambda logit: float(error[logit])) * compute_edge_reach_px(cell) * distances]
     )
-    encoder.shortcut.weight.copy_(encode.T.reshape(latent, -1, cell, cell))
-    cast(Tensor, encoder.shortcut.bias).copy_(-mean @ encode)
-    decoder.shortcut.weight[:latent].copy_((decode * unit).reshape(latent, -1, cell, cell))
-    decoder.shortcut.weight[latent:].zero_()
-    cast(Tensor, decoder.shortcut.bias).copy_((mean * unit).reshape(-1, cell**2).mean(dim=1))
+    set_shortcuts(encoder, decoder.shortcut, decoder.net, (mean, encode, decode), unit)
+
+
+@torch.no_grad()
+def set_shortcuts(
+    encoder: GroundEncoder,
+    shortcut: nn.ConvTranspose2d,
+    net: ConvolutionalDecoder,
+    autoencoder: tuple[Tensor, Tensor, Tensor],
+    unit: Float[Tensor, " pixels"] | float = 1.0,
+) -> None:
+    """Set the shortcuts to a linear autoencoder, and the outputs of the networks to zero.
+
+    If the shortcut of the decoder reads the joint latent, its weights for the object channels become zero.
+
+    Args:
+        encoder: Encoder with a shortcut.
+        shortcut: Shortcut of the decoder.
+        net: Network of the decoder.
+        autoencoder: Result of `compute_linear_autoencoder`.
+        unit: Factors that convert smooth maps to outputs of the decoder.
+    """
+    (mean, encode, decode), forward = autoencoder, cast(nn.Conv2d, encoder.shortcut)
+    cell, latent = forward.stride[0], forward.out_channels
+    forward.weight.copy_(encode.T.reshape(latent, -1, cell, cell))
+    cast(Tensor, forward.bias).copy_(-mean @ encode)
+    shortcut.weight[:latent].copy_((decode * unit).reshape(latent, -1, cell, cell))
+    shortcut.weight[latent:].zero_()
+    cast(Tensor, shortcut.bias).copy_((mean * unit).reshape(-1, cell**2).mean(dim=1))
     encoder.net.conv_out.weight[:latent].zero_()
-    decoder.net.conv_out.weight.zero_()
-    out_bias.zero_()
+    net.conv_out.weight.zero_()
+    cast(Tensor, net.conv_out.bias).zero_()
 
 
 def compute_smooth_maps(

@@ -23,6 +23,7 @@ from models.vae.ground import (
     GroundEncoder,
     compute_edge_reach_px,
     compute_linear_autoencoder,
+    set_shortcuts,
     split_cells,
 )
 
@@ -120,8 +121,7 @@ def init_level_sets(
 ) -> None:
     """Initialise the outputs to their means and the shortcuts to the best linear autoencoder of the smooth maps.
 
-    The slope of the logits is the one with the smallest occupancy loss. The outputs of the networks are initially zero.
-    If the shortcut of the decoder reads the joint latent, its weights for the object channels become zero.
+    The slope of the logits is the one with the smallest occupancy loss. See `set_shortcuts` for the other values.
 
     Args:
         encoder: Encoder to initialise.
@@ -135,15 +135,8 @@ def init_level_sets(
         distance = smooth.mean(dim=(0, 2, 3))[None, height.shape[1] :, None, None].expand(occupied.shape)
     else:
         cell, latent = encoder.shortcut.stride[0], encoder.shortcut.out_channels
-        mean, encode, decode = compute_linear_autoencoder(split_cells(smooth, cell), latent)
-        encoder.shortcut.weight.copy_(encode.T.reshape(latent, -1, cell, cell))
-        cast(Tensor, encoder.shortcut.bias).copy_(-mean @ encode)
-        decoder.shortcut.weight[:latent].copy_(decode.reshape(latent, -1, cell, cell))
-        decoder.shortcut.weight[latent:].zero_()
-        cast(Tensor, decoder.shortcut.bias).copy_(mean.reshape(-1, cell**2).mean(dim=1))
-        encoder.net.conv_out.weight[:latent].zero_()
-        decoder.net.conv_out.weight.zero_()
-        cast(Tensor, decoder.net.conv_out.bias).zero_()
+        autoencoder = compute_linear_autoencoder(split_cells(smooth, cell), latent)
+        set_shortcuts(encoder, decoder.shortcut, decoder.net, autoencoder)
         nodes = decoder.shortcut(F.pad(encoder.shortcut(smooth), (0,) * 5 + (decoder.shortcut.in_channels - latent,)))
         points = make_spline_matrix(nodes.shape[-1], occupied.shape[-1], nodes.device)
         distance = (points @ nodes @ points.T).chunk(2, dim=1)[1]

@@ -26,7 +26,6 @@ from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.geometry.ground_polygons import build_smooth_ground
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
 
-SMOOTH_BORDERS = "smooth_borders"  # Extra of a ground mesh that has vertices between pixel centres.
 GROUND = -1  # Value of `primitive` for a ground triangle.
 ABOUT = (  # Fields of the scene in the `extras` of a glTF file.
     *("scene_id", "source", "sequence", "frame", "split", "world_xyz_m", "world_yaw_rad"),
@@ -215,7 +214,7 @@ def export_glb(scene: Scene) -> bytes:
     vertices, triangles, class_id = build_painted_ground(scene)
     if len(vertices):
         world.geometry["ground"] = _paint_mesh(vertices, triangles, class_id)
-        extras = {"classes": {name: f"#{COLOR_HEX[name]}" for name in scene.ground_classes}, SMOOTH_BORDERS: True}
+        extras = {"classes": {name: f"#{COLOR_HEX[name]}" for name in scene.ground_classes}}
         world.graph.update("ground", "scene", matrix=np.eye(4), geometry="ground", metadata=extras)
     for category in np.unique(scene.category):
         world.geometry[CATEGORIES[category]] = _make_unit_mesh(category)

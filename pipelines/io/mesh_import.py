@@ -47,12 +47,11 @@ from models.scene import (
 )
 from pipelines.geometry.shape_fitting import fit_boxes_to_corners, fit_boxes_to_edges, fit_ellipsoids
 from pipelines.io.gltf_reader import FAR_M, Glb, MeshPart, place_parts, read_glb
-from pipelines.io.mesh_export import GLTF_FROM_SCENE, SMOOTH_BORDERS
+from pipelines.io.mesh_export import GLTF_FROM_SCENE
 from pipelines.io.mesh_segmentation import (
     COLOR_TOLERANCE,
     Mesh,
     find_nearest_class,
-    find_pixel_centers,
     rasterize_ground,
     segment_mesh,
 )
@@ -159,9 +158,6 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
         raise ValueError(
             f"{(off > COLOR_TOLERANCE).sum()} ground vertices match the colour of no ground class; export it again"
         )
-    if any(part.extras.get(SMOOTH_BORDERS) for part in ground):
-        at_pixels = find_pixel_centers(vertices_m, about["grid"])
-        vertices_m, class_id = vertices_m[at_pixels], class_id[at_pixels]
     height_m, occupied = rasterize_ground(vertices_m, class_id, about["ground_classes"], about["grid"])
     if scene_id:
         about["scene_id"] = scene_id
@@ -322,8 +318,7 @@ def _import_foreign_scene(glb: Glb, scene_id: str, scene_from_file: np.ndarray, 
     ground_m, ground_id, corners_m, box_id, clouds = segment_mesh(mesh, grid)
     require_within("scene_primitives", len(box_id) + len(clouds))
     classes = tuple(n for n in GROUND_CLASSES if n in KITTI_GROUND_CLASSES or (ground_id == GROUND_CLASS_ID[n]).any())
-    at_pixels = find_pixel_centers(ground_m, grid)
-    height_m, occupied = rasterize_ground(ground_m[at_pixels], ground_id[at_pixels], classes, grid)
+    height_m, occupied = rasterize_ground(ground_m, ground_id, classes, grid)
     shapes = zip(fit_boxes_to_corners(corners_m), fit_ellipsoids(clouds), strict=True)
     center_m, rotation, size_m = (np.concatenate(pair) for pair in shapes)
     rotation, size_m = canonicalize_boxes(rotation, size_m)

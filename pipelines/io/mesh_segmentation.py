@@ -263,12 +263,14 @@ def rasterize_ground(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rasterise ground vertices, which lie at the corners or at the centres of pixels.
 
+    Exports with smooth borders have further vertices between pixel centres. They are left out.
+
     A vertex at a corner is the far left corner of its pixel (x = front_m - row * resolution_m). If a pixel has several
     vertices of one class, the highest vertex is used.
 
     Args:
-        vertices_m: (v, 3) vertices in the scene frame (m). Either all vertices lie at pixel corners, or all vertices
-            lie at pixel centres.
+        vertices_m: (v, 3) vertices in the scene frame (m). Either all vertices lie at pixel corners, or vertices lie at
+            pixel centres.
         class_id: (v,) class id of each vertex.
         classes: G ground classes of the raster.
         grid: Raster grid.
@@ -279,6 +281,8 @@ def rasterize_ground(
     Raises:
         ValueError: The vertices lie neither at pixel corners nor at pixel centres, or a vertex lies outside the grid.
     """
+    at_pixels = _find_pixel_centers(vertices_m, grid)
+    vertices_m, class_id = vertices_m[at_pixels], class_id[at_pixels]
     pixel = _find_pixels(vertices_m, grid)
     require_within("raster_pixels", len(classes) * grid.rows * grid.cols, "the grid")
     height_m = np.full((len(classes), grid.rows, grid.cols), -np.inf, np.float32)
@@ -290,16 +294,11 @@ def rasterize_ground(
     return height_m, occupied
 
 
-def find_pixel_centers(vertices_m: np.ndarray, grid: Grid) -> np.ndarray:
-    """Find the ground vertices at pixel centres. The other vertices of an export lie on the borders of classes.
+def _find_pixel_centers(vertices_m: np.ndarray, grid: Grid) -> np.ndarray:
+    """Return which vertices (v,) lie at pixel centres.
 
-    Args:
-        vertices_m: (v, 3) vertices in the scene frame (m).
-        grid: Raster grid.
-
-    Returns:
-        (v,) bool. If a vertex lies outside the grid, or if fewer than MIN_CENTERS of the vertices are found, the mesh
-        is no such export: all are True.
+    If a vertex lies outside the grid, or if fewer than MIN_CENTERS of the vertices are found, all are True. The mesh is
+    then no export with smooth borders.
     """
     at_px = (np.array([grid.front_m, grid.left_m]) - vertices_m[:, :2]) / grid.resolution_m
     inside = (at_px >= -ON_GRID_PX) & (at_px <= np.array([grid.rows, grid.cols]) + ON_GRID_PX)

@@ -192,6 +192,6 @@ def test_pipeline_attaches_by_default():
         for scenes in (plain, attached)
     ]
     assert report.lowered > 0 and report.moved > 0 and hanging[1] < 0.5 * hanging[0]
-    pipeline.register_to_config(neighbour_latents="paper")  # As the paper's presets, which attach nothing.
+    pipeline.register_to_config(attach=False)  # As pipelines of the paper's presets.
     for before, after in zip(plain, pipeline.decode(latents, identities), strict=True):
         assert scenes_equal(before, after)

@@ -147,8 +147,8 @@ def test_heading_penalty_of_car_at_30_degrees():
     for yaw_rad in (np.pi / 6, -np.pi / 6, np.pi / 6 + np.pi):
         car = (*CAR[:3], yaw_rad, 0.999999)
         assert measure(ground, car)["heading"] == pytest.approx(expected, rel=0.02)
-    beside = (CAR[0], (20, 10, 0.75), CAR[2], np.pi / 6, 0.99)  # Off the road.
-    assert measure(ground, beside)["heading"] == 0
+    next_to_road = (CAR[0], (20, 10, 0.75), CAR[2], np.pi / 6, 0.99)  # Off the road.
+    assert measure(ground, next_to_road)["heading"] == 0
 
 
 def test_valid_scene_has_no_penalty():

@@ -21,7 +21,11 @@ def test_pipeline_of_version_0_1_samples_same_latents():
     pipeline = PrITTIPipeline.from_pretrained(GOLDEN / "pipeline")
     pipeline.set_progress_bar_config(disable=True)
     stored = {"noise_scaling": 1.01, "existence_threshold": 0.4}
-    assert pipeline.config == stored | {"neighbour_latents": "reencode", "constraints": False}  # Current defaults.
+    assert pipeline.config == stored | {
+        "neighbour_latents": "reencode",
+        "constraints": False,
+        "attach": True,
+    }  # Current defaults.
     latents = pipeline.sample_latents(["low", "high"], seed=5, indices=[0, 1], num_inference_steps=5)
     assert np.allclose(latents.numpy(), EXPECTED["latents"], atol=1e-4)
 

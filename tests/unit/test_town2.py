@@ -28,7 +28,6 @@ from pipelines.preprocess.sources.town.version2.footprints import (
     measure_penetration,
     separate_buildings,
 )
-from pipelines.preprocess.sources.town.version2.town import invert_land
 from pipelines.schema.tables import SCENES, Shard
 
 BUILDING = CATEGORY_INDEX["construction_big"]
@@ -237,9 +236,9 @@ def test_version_2_outlines_are_simple(seed):
     assert len(ground.slab_class) > 300 and all(top.is_valid and top.area > 0.01 for top in tops)
 
 
-def test_invert_land_returns_board_points():
+def test_land_inverts_its_map():
     land, points = draw_land(np.random.default_rng(5)), np.random.default_rng(6).uniform(0, 300, (50, 2))
-    assert np.allclose(invert_land(land, land.xy(points)), points, atol=1e-6)
+    assert np.allclose(land.uv(land.xy(points)), points, atol=1e-6)
 
 
 def test_penetration_equals_shift_that_separates():

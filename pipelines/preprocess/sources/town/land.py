@@ -39,6 +39,12 @@ class Land:
         """Return the world x and y of board points (..., 2)."""
         return self._bend(np.asarray(uv, np.float64)) @ self._turn().T + self.origin_m[:2]
 
+    def uv(self, xy: np.ndarray) -> np.ndarray:
+        """Return the board points of world points (..., 2), the inverse of `xy`."""
+        x, y = np.moveaxis((np.asarray(xy, np.float64) - self.origin_m[:2]) @ self._turn(), -1, 0)
+        v = y - _draw_waves(self.bend_v, x)
+        return np.stack([x - _draw_waves(self.bend_u, v), v], axis=-1)
+
     def direction(self, uv: np.ndarray, along: np.ndarray) -> np.ndarray:
         """Return the unit world direction (..., 2) of the board direction `along` (..., 2) at `uv`."""
         bent = self._bend(uv)
@@ -153,6 +159,7 @@ class Sheet:
         s, t, size_m = np.atleast_1d(s), np.atleast_1d(t), np.atleast_2d(size_m)
         rows = np.empty((len(s), 11))
         rows[:, :2] = frame.uv(s, t)
+        yaw_rad = self.take_yaw(yaw_rad, len(s))
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         rows[:, 2] = cos * frame.along[0] + sin * frame.inward[0]
         rows[:, 3] = cos * frame.along[1] + sin * frame.inward[1]
@@ -160,6 +167,10 @@ class Sheet:
         rows[:, 7], rows[:, 8], rows[:, 9], rows[:, 10] = bottom_m, ellipsoid, timestamp, track
         self.box_label += [label] * len(s)
         self.box_rows.append(rows)
+
+    def take_yaw(self, yaw_rad: np.ndarray | float, count: int) -> np.ndarray | float:
+        """Return the angle on the board of `count` boxes; a subclass can keep the angle until `find_directions`."""
+        return yaw_rad
 
     def find_directions(self, rows: np.ndarray, land: Land) -> np.ndarray:
         """Return the world directions (n, 2) of the length axes of all boxes, whose rows are joined in `rows`."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipelines.preprocess.sources.town.assets import Rect, Site, draw_sizes, place_cars, plant_border, plant_garden
-from pipelines.preprocess.sources.town.land import LocalFrame, trace_outlines
+from pipelines.preprocess.sources.town.land import LocalFrame, Sheet, trace_outlines
 
 NOTHING, TERRAIN, GROUND, PARKING = -1, 0, 1, 2
 CELL_CLASS = ("terrain", "ground", "parking")
@@ -201,19 +202,42 @@ def paint_plots(
     for low, high, base in ((0.0, split, front), (split, depth, back)):
         if high - low < 0.3:
             continue
-        here = []
-        for value, (a, b, c, d) in rects:
-            a, b, c, d = max(a, 0.0), min(b, width), max(c, low), min(d, high)
-            if b - a > 0.05 and d - c > 0.05:
-                here.append((value, a, b, c, d))
-        s = _list_lines([0.0, width] + [x for r in here for x in r[1:3]])
-        t = _list_lines([low, high] + [x for r in here for x in r[3:5]])
-        cells = np.full((len(s) - 1, len(t) - 1), base)
-        ms, mt = (np.array(s)[:-1] + np.array(s)[1:]) / 2, (np.array(t)[:-1] + np.array(t)[1:]) / 2
-        for value, a, b, c, d in here:
-            cells[np.ix_((ms > a) & (ms < b), (mt > c) & (mt < d))] = value
-        for value, outline in trace_outlines(cells, s, t):
-            site.sheet.slab(frame, CELL_CLASS[value], outline)
+        paint_strip(site.sheet, frame, (0.0, width, low, high), base, rects, 0.05, _list_lines)
+
+
+def paint_strip(
+    sheet: Sheet,
+    frame: LocalFrame,
+    area: Rect,
+    base: int,
+    rects: list[tuple[int, Rect]],
+    least: float,
+    list_lines: Callable[[list[float]], list[float]],
+) -> None:
+    """Paint the slabs of a rectangle: class `base`, and the parts of `rects` inside the rectangle on top.
+
+    Args:
+        sheet: Sheet to which slabs are added.
+        frame: Frame of the rectangle.
+        area: Rectangle (s0, s1, t0, t1) in metres.
+        base: Index into CELL_CLASS, or NOTHING.
+        rects: (class, rectangle) of each part.
+        least: Smaller extents (m) of a part are left out.
+        list_lines: Function that sorts grid lines and merges close ones.
+    """
+    here = []
+    for value, (a, b, c, d) in rects:
+        a, b, c, d = max(a, area[0]), min(b, area[1]), max(c, area[2]), min(d, area[3])
+        if b - a > least and d - c > least:
+            here.append((value, a, b, c, d))
+    s = list_lines([*area[:2]] + [x for r in here for x in r[1:3]])
+    t = list_lines([*area[2:]] + [x for r in here for x in r[3:5]])
+    cells = np.full((len(s) - 1, len(t) - 1), base)
+    ms, mt = (np.array(s)[:-1] + np.array(s)[1:]) / 2, (np.array(t)[:-1] + np.array(t)[1:]) / 2
+    for value, a, b, c, d in here:
+        cells[np.ix_((ms > a) & (ms < b), (mt > c) & (mt < d))] = value
+    for value, outline in trace_outlines(cells, s, t):
+        sheet.slab(frame, CELL_CLASS[value], outline)
 
 
 def _list_lines(values: list[float]) -> list[float]:

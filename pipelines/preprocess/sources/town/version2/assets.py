@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,22 +27,10 @@ class StreetSheet(Sheet):
         super().__init__()
         self.box_yaw_rad: list[np.ndarray] = []  # (n,) angle of each box to the s axis of its frame.
 
-    def boxes(
-        self,
-        frame: LocalFrame,
-        label: str,
-        s: np.ndarray | Sequence[float] | float,
-        t: np.ndarray | Sequence[float] | float,
-        size_m: np.ndarray,
-        yaw_rad: np.ndarray | float = 0.0,
-        bottom_m: np.ndarray | float = 0.0,
-        ellipsoid: bool = False,
-        timestamp: np.ndarray | int = -1,
-        track: np.ndarray | int = -1,
-    ) -> None:
-        """Add n boxes of one label; see `Sheet.boxes`. The angle is measured in the world, not on the board."""
-        super().boxes(frame, label, s, t, size_m, 0.0, bottom_m, ellipsoid, timestamp, track)
-        self.box_yaw_rad.append(np.broadcast_to(np.asarray(yaw_rad, float), len(self.box_rows[-1])))
+    def take_yaw(self, yaw_rad: np.ndarray | float, count: int) -> np.ndarray | float:
+        """Keep the angle of `count` boxes, which is measured in the world, and return an angle of 0 on the board."""
+        self.box_yaw_rad.append(np.broadcast_to(np.asarray(yaw_rad, float), count))
+        return 0.0
 
     def find_directions(self, rows: np.ndarray, land: Land) -> np.ndarray:
         """Return the world directions (n, 2) of the length axes of all boxes, whose rows are joined in `rows`."""

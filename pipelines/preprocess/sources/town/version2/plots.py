@@ -12,7 +12,8 @@ from typing import Literal
 import numpy as np
 
 from pipelines.preprocess.sources.town.assets import Rect, draw_sizes
-from pipelines.preprocess.sources.town.land import LocalFrame, trace_outlines
+from pipelines.preprocess.sources.town.land import LocalFrame
+from pipelines.preprocess.sources.town.plots import GROUND, NOTHING, PARKING, TERRAIN, paint_strip
 from pipelines.preprocess.sources.town.version2.assets import (
     Site,
     add_cars,
@@ -23,8 +24,6 @@ from pipelines.preprocess.sources.town.version2.assets import (
     plant_garden,
 )
 
-NOTHING, TERRAIN, GROUND, PARKING = -1, 0, 1, 2
-CELL_CLASS = ("terrain", "ground", "parking")
 MIN_FRONT_M = 5.0
 MIN_PIECE_M = 0.15
 TURNED = 0.18  # Share of detached houses that are not parallel to the street.
@@ -216,7 +215,7 @@ def _add_building(site: Site, frame: LocalFrame, label: str, walls: Rect, height
 
 
 def _build_drive(site: Site, frame: LocalFrame, row: Row, walls: Rect, strip: tuple[float, float]) -> Rect:
-    """Build a drive beside a house, with a garage at its end, a car and low walls. Return the drive."""
+    """Build a drive next to a house, with a garage at its end, a car and low walls. Return the drive."""
     rng, width = site.rng, strip[1] - strip[0]
     end = float(np.clip(walls[2] + rng.uniform(1.0, 9.0), 4.8, max(4.8, row.depth - 6.0)))
     if rng.random() < site.district.garages and row.depth - end > 5.0:
@@ -301,19 +300,7 @@ def paint_plot(
     for low, high in ((0.0, min(split, depth)), (min(split, depth), depth)):
         if high - low < 0.3:
             continue
-        here = []
-        for value, (a, b, c, d) in rects:
-            a, b, c, d = max(a, 0.0), min(b, width), max(c, low), min(d, high)
-            if b - a > MIN_PIECE_M and d - c > MIN_PIECE_M:
-                here.append((value, a, b, c, d))
-        s = _list_lines([0.0, width] + [x for r in here for x in r[1:3]])
-        t = _list_lines([low, high] + [x for r in here for x in r[3:5]])
-        cells = np.full((len(s) - 1, len(t) - 1), base)
-        ms, mt = (np.array(s)[:-1] + np.array(s)[1:]) / 2, (np.array(t)[:-1] + np.array(t)[1:]) / 2
-        for value, a, b, c, d in here:
-            cells[np.ix_((ms > a) & (ms < b), (mt > c) & (mt < d))] = value
-        for value, outline in trace_outlines(cells, s, t):
-            site.sheet.slab(frame, CELL_CLASS[value], outline)
+        paint_strip(site.sheet, frame, (0.0, width, low, high), base, rects, MIN_PIECE_M, _list_lines)
 
 
 def _list_lines(values: list[float]) -> list[float]:

@@ -171,18 +171,6 @@ def _settle_boxes(boxes: dict[str, np.ndarray], ground: SlabGround, land: Land) 
 # ---------------------------------------------------------------- free poses
 
 
-def invert_land(land: Land, xy_m: np.ndarray) -> np.ndarray:
-    """Return the board points (..., 2) of world points."""
-    cos, sin = np.cos(land.yaw_rad), np.sin(land.yaw_rad)
-    bent = (xy_m - land.origin_m[:2]) @ np.array([[cos, -sin], [sin, cos]])
-
-    def wave(waves: np.ndarray, at: np.ndarray) -> np.ndarray:
-        return (waves[:, 0] * np.sin(at[..., None] * waves[:, 1] + waves[:, 2])).sum(axis=-1)
-
-    v = bent[..., 1] - wave(land.bend_v, bent[..., 0])
-    return np.stack([bent[..., 0] - wave(land.bend_u, v), v], axis=-1)
-
-
 def _draw_free_poses(rng: np.random.Generator, streets: Streets, land: Land, count: int) -> np.ndarray:
     """Return poses (count, 3, 4) whose crops lie in the built area at any place and heading.
 
@@ -199,7 +187,7 @@ def _draw_free_poses(rng: np.random.Generator, streets: Streets, land: Land, cou
         middle, yaw = land.xy(rng.uniform(low, high)), rng.uniform(-np.pi, np.pi)
         forward, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
         origin = middle - forward * FREE_CROP_M / 2
-        corners = invert_land(land, origin + square @ np.stack([forward, left]))
+        corners = land.uv(origin + square @ np.stack([forward, left]))
         if (corners < low).any() or (corners > high).any():
             continue
         z = land.surface_m(origin) + IMU_HEIGHT_M
