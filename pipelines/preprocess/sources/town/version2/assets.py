@@ -12,7 +12,8 @@ from pipelines.preprocess.sources.town.version2.districts import District, Varia
 
 ALIGNED = 0.75  # Share of ellipsoids whose axes are parallel to the street.
 CLUSTER_M = 1.3  # Spread of the plants of a cluster.
-PLANTS_PER_CLUSTER = 2.4
+PLANTS_PER_CLUSTER = 1.2
+PLANT_CHOICES = 4  # Each plant takes the place of so many that is farthest from the plants before it.
 WALL_LABELS = ("wall", "fence", "gate", "guardrail")
 WALL_SHARES = (0.6, 0.29, 0.09, 0.02)
 
@@ -58,20 +59,33 @@ def is_free(s: np.ndarray, t: np.ndarray, taken: list[Rect], margin: float) -> n
 
 
 def scatter_plants(
-    site: Site, width: float, depth: float, count: int, mean_t: float, taken: list[Rect]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return free positions (s, t) of at most `count` plants in clusters, on average mean_t from the front."""
+    site: Site, width: float, depth: float, count: int, mean_t: float, taken: list[Rect], planted: np.ndarray
+) -> np.ndarray:
+    """Return free places (s, t) of at most `count` plants, about mean_t from the front and apart from `planted`."""
     rng = site.rng
     clusters = max(1, round(count / PLANTS_PER_CLUSTER))
-    place = rng.integers(0, clusters, 2 * count + 4)
+    place = rng.integers(0, clusters, PLANT_CHOICES * (count + 2))
     s = rng.uniform(0.2, max(0.3, width - 0.2), clusters)[place] + CLUSTER_M * rng.standard_normal(len(place))
     t = rng.gamma(1.8, mean_t / 1.8, clusters)[place] + CLUSTER_M * rng.standard_normal(len(place))
     inside = (s > 0.2) & (s < width - 0.2) & (t > 0.4) & (t < depth - 0.2)
     inside &= is_free(s, t, taken, 0.25)
-    return s[inside][:count], t[inside][:count]
+    return choose_apart(np.stack([s[inside], t[inside]], axis=1), count, planted)
 
 
-def draw_yaw(rng: np.random.Generator, count: int, spread_rad: float = 0.06) -> np.ndarray:
+def choose_apart(places: np.ndarray, count: int, planted: np.ndarray) -> np.ndarray:
+    """Return at most `count` of the places (n, 2), by Mitchell's best-candidate sampling (1991).
+
+    Each chosen place is the one of the next few places that is farthest from `planted` (m, 2) and from those chosen.
+    """
+    chosen = list(planted)
+    for group in np.array_split(places, max(1, min(count, len(places)))):
+        if len(group):
+            gaps = np.linalg.norm(group[:, None] - np.array(chosen).reshape(1, -1, 2), axis=2)
+            chosen.append(group[int(gaps.min(axis=1, initial=np.inf).argmax())])
+    return np.array(chosen[len(planted) :]).reshape(-1, 2)
+
+
+def draw_yaw(rng: np.random.Generator, count: int, spread_rad: float = 0.15) -> np.ndarray:
     """Return angles (count,) along or across the street."""
     return np.pi / 2 * rng.integers(0, 2, count) + rng.normal(0, spread_rad, count)
 
@@ -97,11 +111,15 @@ def plant_garden(
         ("bush", district.bushes_per_100m * variation.bushes, 3.4),
         ("tree", district.trees_per_100m * variation.trees, 4.4),
     )
+    planted = {"shrub": np.empty((0, 2)), "ellipsoid": np.empty((0, 2))}
     for what, rate, mean_t in rates:
         count = int(rng.poisson(rate * lush * width / 100))
         if not count:
             continue
-        s, t = scatter_plants(site, width, depth, count, mean_t, taken)
+        kind = "shrub" if what == "shrub" else "ellipsoid"
+        places = scatter_plants(site, width, depth, count, mean_t, taken, planted[kind])
+        planted[kind] = np.concatenate([planted[kind], places])
+        s, t = places.T
         if what != "shrub":
             add_ellipsoids(site, frame, s, t, what)
             continue

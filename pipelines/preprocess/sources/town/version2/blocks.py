@@ -12,13 +12,14 @@ import numpy as np
 from pipelines.preprocess.sources.town.assets import draw_sizes, plant_strip
 from pipelines.preprocess.sources.town.land import LocalFrame
 from pipelines.preprocess.sources.town.streets import CityBlock, trace_kerb
-from pipelines.preprocess.sources.town.version2.assets import Site, add_cars, add_ellipsoids, add_patch
+from pipelines.preprocess.sources.town.version2.assets import Site, add_cars, add_ellipsoids, add_patch, draw_yaw
 from pipelines.preprocess.sources.town.version2.plots import MIN_PIECE_M, Kind, build_green, build_row, draw_row
 
 CAR_SLOT_M = 6.6
 VERGE_M = (2.2, 3.6)  # Depth of a verge with a path, which takes the place of a sidewalk.
 PATH_M = 1.1  # Width of this path.
 BAY_DEPTH_M = 2.3
+POLE_SPREAD_RAD = 0.2  # Boxes of poles are annotated along or across the street, with this spread.
 NARROW_M = 2.9  # In streets with a smaller half width, cars stand on one side only.
 MIN_CORNER_WALK_M = 0.7  # Least distance of the inner corner of a sidewalk from the kerb, along each street.
 
@@ -246,10 +247,12 @@ def _add_lamps(site: Site, frame: LocalFrame, s: np.ndarray, t: float) -> None:
     if not len(s):
         return
     pole = draw_sizes(site.rng, "bigPole", len(s))
-    site.sheet.boxes(frame, "bigPole", s, t, pole, site.rng.normal(0, 0.1, len(s)))
+    site.sheet.boxes(frame, "bigPole", s, t, pole, draw_yaw(site.rng, len(s), POLE_SPREAD_RAD))
     lit = site.rng.random(len(s)) < site.district.lamps
     head = draw_sizes(site.rng, "lamp", len(s))
-    site.sheet.boxes(frame, "lamp", s[lit], t - 0.35, head[lit], np.pi / 2, pole[lit, 2] - 0.25)
+    site.sheet.boxes(
+        frame, "lamp", s[lit], t - 0.35, head[lit], draw_yaw(site.rng, int(lit.sum())), pole[lit, 2] - 0.25
+    )
 
 
 def _add_sign(site: Site, frame: LocalFrame, s: float, t: float) -> None:
@@ -258,11 +261,11 @@ def _add_sign(site: Site, frame: LocalFrame, s: float, t: float) -> None:
     tall = rng.random() < 0.5
     pole = draw_sizes(rng, "bigPole" if tall else "smallPole", 1, (1.0, 1.0, 0.8) if tall else (1.0, 1.0, 1.2))[0]
     pole[2] = max(2.0, pole[2])
-    site.sheet.boxes(frame, "bigPole" if tall else "smallPole", s, t, pole)
+    site.sheet.boxes(frame, "bigPole" if tall else "smallPole", s, t, pole, draw_yaw(rng, 1, POLE_SPREAD_RAD))
     bottom = pole[2] - 0.1
     for _ in range(1 + (rng.random() < 0.2)):  # The second sign is below the first one.
         sign = draw_sizes(rng, "trafficSign", 1)[0]
-        site.sheet.boxes(frame, "trafficSign", s, t, sign, np.pi / 2, bottom)
+        site.sheet.boxes(frame, "trafficSign", s, t, sign, draw_yaw(rng, 1), bottom)
         bottom -= sign[2] + 0.05
 
 
@@ -270,6 +273,6 @@ def _add_lights(site: Site, frame: LocalFrame, s: float, t: float) -> None:
     """Add a pole with two traffic lights."""
     pole = draw_sizes(site.rng, "bigPole", 1, 0.75)[0]
     pole[2] = max(3.4, pole[2])
-    site.sheet.boxes(frame, "smallPole", s, t, pole)
+    site.sheet.boxes(frame, "smallPole", s, t, pole, draw_yaw(site.rng, 1, POLE_SPREAD_RAD))
     lights = draw_sizes(site.rng, "trafficLight", 2)
-    site.sheet.boxes(frame, "trafficLight", [s] * 2, [t] * 2, lights, np.pi / 2, np.array([2.2, 2.9]))
+    site.sheet.boxes(frame, "trafficLight", [s] * 2, [t] * 2, lights, draw_yaw(site.rng, 2), np.array([2.2, 2.9]))

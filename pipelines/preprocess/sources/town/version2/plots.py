@@ -260,7 +260,7 @@ def _add_belongings(site: Site, frame: LocalFrame, walls: Rect, gates: list[tupl
         start = gates[0][1] + 0.5 if gates else rng.uniform(walls[0], walls[1])
         label = "trashbin" if rng.random() < 0.55 else "box"
         t = max(0.4, front * rng.uniform(0.15, 0.8))
-        yaw = np.pi / 2 * (rng.random(count) < 0.7) + rng.normal(0, 0.1, count)
+        yaw = np.pi / 2 * (rng.random(count) < 0.7) + rng.normal(0, 0.15, count)
         site.sheet.boxes(frame, label, start + 1.2 * np.arange(count), t, draw_sizes(rng, label, count), yaw)
     count = rng.poisson(site.district.bicycles_per_plot * site.variation.bicycles)
     if count:
