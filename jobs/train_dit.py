@@ -67,6 +67,10 @@ class Config:
     """Normalise each latent channel to mean 0 and standard deviation 1 (default: as in the preset; paper: False)."""
     timestep_sampling: Literal["uniform", "logit-normal"] = "uniform"
     """Distribution of training timesteps: uniform (the paper), or logit-normal, which prefers middle timesteps."""
+    loss_weighting: Literal["uniform", "min-snr"] = "uniform"
+    """Weighting of the timesteps in the loss: uniform (the paper), or min-snr (Hang et al., 2023)."""
+    ema_decay: float | None = None
+    """Decay of the exponential moving average of the weights (default: as in the preset)."""
     gradient_accumulation_steps: int = 1
     """Divide each worker's batch into this number of parts, which are processed in sequence to save memory."""
     precision: Literal["auto", "fp32", "bf16"] = "auto"

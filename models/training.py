@@ -293,6 +293,8 @@ def make_layout_loss(
 
 
 TimestepSampling = Literal["uniform", "logit_normal"]
+LossWeighting = Literal["uniform", "min_snr"]
+MIN_SNR_GAMMA = 5.0  # Value of Hang et al. (2023).
 # Mean and standard deviation of logit(t / 1000). Half of the timesteps lie between 196 and 552.
 LOGIT_NORMAL = (-0.6, 1.2)
 # Compiled layers of the object encoder are compiled for each number of slots, of which the paper's 514 slots give five.
@@ -320,12 +322,36 @@ def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, nu
     return (uniform * num_timesteps).long().clamp(max=num_timesteps - 1)
 
 
+def compute_loss_weight(dit: DiT, timestep: Int[Tensor, " b"], weighting: LossWeighting) -> Float[Tensor, " b"]:
+    """Return the weight of the squared noise error in the training loss.
+
+    The paper uses "uniform": the squared error of the network output has the same weight at every timestep. "min_snr"
+    is the weighting of Hang et al. (2023): the squared error of the clean latent has the weight min(SNR, 5), where SNR
+    is the ratio of signal and noise variance. It prevents that timesteps of little noise dominate the training.
+
+    Args:
+        dit: Model, which defines the noise schedule.
+        timestep: Timesteps.
+        weighting: Weighting of the timesteps.
+
+    Returns:
+        One weight per sample.
+    """
+    if weighting == "uniform":
+        return dit.loss_weight(timestep)
+    noise, signal = (dit.noise_shares[timestep] ** 2).unbind(1)
+    return (signal / noise).clamp(max=MIN_SNR_GAMMA) * noise / signal
+
+
 def make_diffusion_loss(
-    dit: DiT, label_dropout: float, timestep_sampling: TimestepSampling = "uniform"
+    dit: DiT,
+    label_dropout: float,
+    timestep_sampling: TimestepSampling = "uniform",
+    loss_weighting: LossWeighting = "uniform",
 ) -> LossFunction:
     """Return the loss function of stage 2 (training of the DiT): mean squared error of the noise (Eq. "LDM").
 
-    With v-prediction, the error is weighted by `DiT.loss_weight`. Each step samples new latents from the cached
+    With v-prediction, the error is weighted (`compute_loss_weight`). Each step samples new latents from the cached
     posteriors. Labels are dropped once per sample. Before, a partial label loses each density with the probability
     PART_DROPOUT.
 
@@ -333,6 +359,7 @@ def make_diffusion_loss(
         dit: Model on its device, which defines the noise schedule.
         label_dropout: Probability that a training sample gets the null label.
         timestep_sampling: Density of the timesteps (`sample_timesteps`).
+        loss_weighting: Weighting of the timesteps (`compute_loss_weight`).
 
     Returns:
         A function that computes the losses from a batch of posteriors (`mean`, `logvar`) and labels (`label`).
@@ -360,7 +387,8 @@ def make_diffusion_loss(
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
         predicted = model(diffusion.add_noise(latent, noise, timestep), timestep, label)
         error = F.mse_loss(predicted.float(), noise, reduction="none").flatten(1).mean(1)
-        return {"loss": (dit.loss_weight(timestep) * error).mean(), "noise_error": error.mean()}
+        weight = compute_loss_weight(dit, timestep, loss_weighting)
+        return {"loss": (weight * error).mean(), "noise_error": error.mean()}
 
     return loss
 
@@ -612,6 +640,7 @@ def make_dit_trainer(
     wrap: Wrap = lambda m: m,
     execution: ExecutionConfig | None = None,
     timestep_sampling: TimestepSampling = "uniform",
+    loss_weighting: LossWeighting = "uniform",
 ) -> Trainer:
     """Return a trainer of a diffusion transformer.
 
@@ -623,13 +652,14 @@ def make_dit_trainer(
         wrap: Function that wraps the model, for example with DistributedDataParallel; None: no wrapper.
         execution: Options of the execution; None: the defaults of `ExecutionConfig`.
         timestep_sampling: Density of the timesteps (`sample_timesteps`).
+        loss_weighting: Weighting of the timesteps (`compute_loss_weight`).
 
     Returns:
         The trainer.
     """
     execution = execution or ExecutionConfig()
     model = model.to(device)
-    loss = make_diffusion_loss(model, label_dropout, timestep_sampling)
+    loss = make_diffusion_loss(model, label_dropout, timestep_sampling, loss_weighting)
     if execution.compile:
         for block in model.blocks:  # All blocks share the compiled code.
             block.compile(dynamic=False)

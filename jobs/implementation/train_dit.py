@@ -40,6 +40,7 @@ from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTPreset, find_preset
 from models.training import (
     ExecutionConfig,
+    LossWeighting,
     OptimizerConfig,
     TimestepSampling,
     Trainer,
@@ -80,14 +81,14 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     record = trainer.guard_run_name(name, home_path("runs"), identity)
     tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
     execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
-    timestep_sampling = parse_timestep_sampling(config)
+    timesteps = parse_timestep_sampling(config), parse_loss_weighting(config)
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
     check_training_labels(shards, label_kind)
     training = TrainingRun(
         name=name,
         storage_path=home_path("runs"),
-        build=partial(build, architecture, settings, execution, row.label_dropout, start, timestep_sampling),
+        build=partial(build, architecture, settings, execution, row.label_dropout, start, *timesteps),
         stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
         reader=LatentReader(latents_root, label_kind),
         settings=settings,
@@ -123,6 +124,11 @@ def check_training_labels(shards: list[Shard], kind: str) -> None:
 def parse_timestep_sampling(config: Config) -> TimestepSampling:
     """Return the distribution of training timesteps."""
     return "logit_normal" if config.timestep_sampling == "logit-normal" else "uniform"
+
+
+def parse_loss_weighting(config: Config) -> LossWeighting:
+    """Return the weighting of the timesteps in the loss."""
+    return "min_snr" if config.loss_weighting == "min-snr" else "uniform"
 
 
 def make_smoke_latents(root: str) -> None:
@@ -167,6 +173,7 @@ def make_optimizer_config(config: Config, row: DiTPreset) -> OptimizerConfig:
         learning_rate=config.learning_rate,
         final_learning_rate=config.final_learning_rate,
         warmup_steps=config.warmup_steps,
+        ema_decay=config.ema_decay,
     )
 
 
@@ -202,6 +209,8 @@ def make_run_identity(
         identity |= {"start_from": start.digest}
     if (sampling := parse_timestep_sampling(config)) != "uniform":  # earlier versions did not record this option
         identity |= {"timesteps": RECORDED_TIMESTEPS[sampling]}
+    if (weighting := parse_loss_weighting(config)) != "uniform":
+        identity |= {"loss_weighting": weighting}
     return identity
 
 
@@ -262,6 +271,7 @@ def build(
     label_dropout: float,
     start: Start | None,
     timestep_sampling: TimestepSampling,
+    loss_weighting: LossWeighting,
     device: torch.device,
     wrap: Wrap,
 ) -> Trainer:
@@ -270,7 +280,7 @@ def build(
     model = DiT(**architecture)
     if start:
         model.load_state_dict(start.state)
-    return make_dit_trainer(model, settings, label_dropout, device, wrap, execution, timestep_sampling)
+    return make_dit_trainer(model, settings, label_dropout, device, wrap, execution, timestep_sampling, loss_weighting)
 
 
 def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:

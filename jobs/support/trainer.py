@@ -406,12 +406,14 @@ def override_settings(settings: OptimizerConfig, **changes: Any) -> OptimizerCon
         The changed settings.
 
     Raises:
-        ValueError: A change is not positive.
+        ValueError: A change is not positive, or the decay of the moving average is not below 1.
     """
     changes = {name: value for name, value in changes.items() if value is not None}
     for name, value in changes.items():
         if value <= 0:
             raise ValueError(f"--{name.replace('_', '-')} is {value}, expected more than 0")
+        if name == "ema_decay" and value >= 1:
+            raise ValueError(f"--ema-decay is {value}, expected less than 1, such as 0.999")
     return replace(settings, **changes)
 
 

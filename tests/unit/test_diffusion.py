@@ -3,14 +3,21 @@
 import numpy as np
 import pytest
 import torch
-from diffusers import DDIMScheduler, RePaintScheduler
+from diffusers import DDIMScheduler, DDPMScheduler, RePaintScheduler
+from diffusers.training_utils import compute_snr
 from helpers import LATENT_SHAPE
 
 from models.dit import DiT
 from models.sampling.diffusion import Diffusion, InpaintCondition, SamplingSchedule, SceneNoise, sample, with_guidance
 from models.sampling.repaint import repaint_transitions
 from models.sampling.schedulers import SchedulerConfig
-from models.training import ExecutionConfig, NonFiniteLossError, OptimizerConfig, make_dit_trainer
+from models.training import (
+    ExecutionConfig,
+    NonFiniteLossError,
+    OptimizerConfig,
+    compute_loss_weight,
+    make_dit_trainer,
+)
 
 
 def make_random_dit(seed: int = 0, **options) -> DiT:
@@ -343,3 +350,19 @@ def test_pseudoinverse_guidance_halves_error():
         assert torch.equal(made[:, 0], given[:, 0])
         errors[weight] = (made[:, 1] - given[:, 1]).abs().mean().item()
     assert errors[1.0] < 0.5 * errors[0.0], errors
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
+def test_min_snr_weight_agrees_with_diffusers(prediction):
+    dit = DiT(channels=8, size=8, patch=2, width=32, depth=1, heads=2, prediction=prediction)
+    scheduler = DDPMScheduler(beta_start=dit.diffusion.beta_start, beta_end=dit.diffusion.beta_end)
+    timestep = torch.tensor([0, 50, 126, 467, 999])
+    snr = compute_snr(scheduler, timestep)
+    # The weight that diffusers' training scripts give the squared error of the output, times the output's error for a
+    # noise error of 1 (v = noise / sqrt(alpha_bar) if the noisy latent is known).
+    output_weight = snr.clamp(max=5) / (snr if prediction == "epsilon" else snr + 1)
+    output_error = torch.ones(5) if prediction == "epsilon" else 1 / scheduler.alphas_cumprod[timestep]
+    weight = compute_loss_weight(dit, timestep, "min_snr")
+    assert torch.allclose(weight, output_weight * output_error, rtol=1e-3)
+    assert weight[0] < 0.01 and weight[3:].allclose(torch.ones(2))
+    assert torch.equal(compute_loss_weight(dit, timestep, "uniform"), dit.loss_weight(timestep))
