@@ -99,6 +99,9 @@ class Config:
     """Lowest and highest z of the grid of 256 x 256 x 32 voxels, in metres."""
     num_examples: int = 3
     """Number of scenes to show in each of two groups: the best and the worst reconstructions."""
+    guess_scenes: int = 0
+    """Also write guess.html, on which a reader guesses which scenes are generated: number of real and of generated
+    scenes."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/<run>, or evaluations/latest without --run)."""
     if_busy: IfBusyOption = "refuse"

@@ -158,7 +158,7 @@ def check_outpaint_scenes(config: OutpaintConfig) -> None:
 
 def check_evaluate_scenes(config: EvaluateConfig) -> None:
     apply_protocol(config)
-    for name, least in (("num_examples", 0), ("max_scenes", 2), ("supersample", 1)):
+    for name, least in (("num_examples", 0), ("max_scenes", 2), ("supersample", 1), ("guess_scenes", 0)):
         if (value := getattr(config, name)) is not None and value < least:
             raise ValueError(f"--{name.replace('_', '-')} is {value}, expected {least} or more")
     if config.max_reconstructed_scenes is not None and not config.lvae:

@@ -17,6 +17,7 @@ from jobs.support.progress import JobProgress
 from jobs.support.scores import publish_scores
 from jobs.support.value_names import REFERENCES
 from models.pretrained import INDEX_NAME
+from models.scene import Scene
 from models.tensors import EXISTENCE_THRESHOLD
 from models.uris import split_name
 from pipelines.evaluation.evaluate import (
@@ -47,6 +48,7 @@ from pipelines.metrics.inception_score import compute_streamed_inception_score
 from pipelines.metrics.lite0 import describe_lite0
 from pipelines.metrics.vgg16 import describe_vgg16
 from pipelines.reporting.evaluation_report import ExamplePictures, format_value, list_headlines, render_evaluation_html
+from pipelines.reporting.guess_page import render_guess_html
 from pipelines.reporting.reconstruction_report import render_reconstruction_html, select_overall_scores
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
@@ -173,7 +175,27 @@ def evaluate_generation(
         words.append(f"Dropped pictures (entirely white, or any pixel of pure black): {numbers}.")
     html = render_evaluation_html(convert_estimates(scores), counts, shown, words)
     storage.write_text(html, storage.join_uri(output, "evaluation.html"))
+    if config.guess_scenes:
+        write_guess_page(sides, config.guess_scenes, storage.join_uri(output, "guess.html"), bar)
     return scores
+
+
+def write_guess_page(sides: dict[str, SceneSet], count: int, path: str, bar: JobProgress) -> None:
+    """Write a page with `count` evenly spread real scenes and as many generated scenes in random order.
+
+    Raises:
+        ValueError: A side consists of pictures, not of scenes.
+    """
+    chosen: dict[str, list[Scene]] = {}
+    for name in ("real", "generated"):
+        side = sides[name]
+        if not isinstance(side, SceneSubset):
+            raise ValueError(f"--guess-scenes draws scenes, but the {name} side is a file of pictures; omit it")
+        selected = replace(side, limit=min(count, count_scenes(side)), pick="spread")
+        chosen[name] = [scene for shard, rows in selected.shards() for scene in shard.scenes(rows)]
+    task = bar.add_task("draw guess.html", total=sum(map(len, chosen.values())))
+    html = render_guess_html(**chosen, title="Real or generated?", on_scene=lambda: bar.advance(task))
+    storage.write_text(html, path)
 
 
 def evaluate_streamed(

@@ -195,11 +195,13 @@ def test_evaluate_scores_generated_scenes_and_reconstruction(smoke, samples, tmp
             generated=str(samples),
             lvae=str(smoke / "models/lvae-smoke"),
             num_examples=0,
+            guess_scenes=2,
             num_actors=1,
             output=str(tmp_path),
         )
     )
     made = scores["generation"]
+    assert (tmp_path / "guess.html").read_text().count("<img") == 4
     assert made["scenes"] == {"real": 9, "generated": 9}
     assert made["layout_frechet"]["low"] < made["layout_frechet"]["value"] < made["layout_frechet"]["high"]
     sets = scores["reconstruction"]["sets"]
