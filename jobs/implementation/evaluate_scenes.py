@@ -194,7 +194,9 @@ def write_guess_page(sides: dict[str, SceneSet], count: int, path: str, bar: Job
         selected = replace(side, limit=min(count, count_scenes(side)), pick="spread")
         chosen[name] = [scene for shard, rows in selected.shards() for scene in shard.scenes(rows)]
     task = bar.add_task("draw guess.html", total=sum(map(len, chosen.values())))
-    html = render_guess_html(**chosen, title="Real or generated?", on_scene=lambda: bar.advance(task))
+    html = render_guess_html(
+        chosen["real"], chosen["generated"], "Real or generated?", on_scene=lambda: bar.advance(task)
+    )
     storage.write_text(html, path)
 
 
