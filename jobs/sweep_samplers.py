@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
-"""Compare samplers and numbers of denoising steps against the same real scenes.
+"""Compare samplers, numbers of steps and guidance scales against the same real scenes.
 
     jobs/sweep_samplers.py                                             256 town scenes each, 10 to 250 steps
     jobs/sweep_samplers.py --samplers ddpm dpm++ --num-inference-steps 10 250 --num-scenes 64
     jobs/sweep_samplers.py --samplers dpm++ --num-inference-steps 20 --noise-scalings 1 1.005 1.01      for a new model
+    jobs/sweep_samplers.py --samplers dpm++ --num-inference-steps 20 --guidance-scale 1 2 4    labels and diversity
 
 The last two rows are other real scenes (the ceiling) and a damaged copy of them (the control), scored in the same way.
 
-The job writes the scenes (source=generated-<sampler>-<steps>), samplers.json, samplers.parquet, figures (SVG) and
+The job writes the scenes (source=generated-<setting>), samplers.json, samplers.parquet, figures (SVG) and
 samplers.html. Run the same command again to resume after an interruption.
 """
 
@@ -45,8 +46,8 @@ class Config:
     """Number of generated scenes per setting, which is also the number of real scenes."""
     seed: int = 0
     """Random seed."""
-    guidance_scale: float = 1.0
-    """Classifier-free guidance scale; 1 switches guidance off."""
+    guidance_scale: tuple[float, ...] = (1.0,)
+    """Classifier-free guidance scales to compare; 1 switches guidance off."""
     constraints: ConstraintsOption = None
     batch_size: int = 8
     """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding."""

@@ -21,7 +21,6 @@ from models.sampling.schedulers import SAMPLERS
 from pipelines.evaluation.evaluate import compare_datasets
 from pipelines.evaluation.features import FeatureConfig, compute_scene_features, count_scenes
 from pipelines.evaluation.sampler_sweep import (
-    CHARTED,
     build_sampler_table,
     draw_sampler_charts,
     make_sampler_row,
@@ -49,8 +48,10 @@ def sweep_samplers(config: Config) -> list[dict]:
             f"--num-scenes is {config.num_scenes}, --num-examples is {config.num_examples}: "
             "expected at least 5 scenes and at least 0 examples"
         )
-    if not config.samplers or not config.num_inference_steps:
-        raise ValueError("--samplers or --num-inference-steps is empty: expected at least one value of each")
+    if not (config.samplers and config.num_inference_steps and config.guidance_scale):
+        raise ValueError(
+            "--samplers, --num-inference-steps or --guidance-scale is empty: expected at least one value of each"
+        )
 
     if unknown := set(config.samplers) - set(SAMPLERS):
         raise ValueError(f"--samplers {' '.join(sorted(unknown))}: expected some of {', '.join(SAMPLERS)}")
@@ -84,18 +85,18 @@ def sweep_samplers(config: Config) -> list[dict]:
                 ).read()
 
             truth = described(real, "real")
-            for sampler, steps, scaling in product(
-                config.samplers, config.num_inference_steps, config.noise_scalings or (None,)
+            for sampler, steps, scaling, guidance in product(
+                config.samplers, config.num_inference_steps, config.noise_scalings or (None,), config.guidance_scale
             ):
                 request = SampleRequest(
                     model=model,
                     output=output,
-                    run=f"{sampler}-{steps}" + (f"-{scaling:g}" if scaling else ""),
+                    run=name_run(config, sampler, steps, scaling, guidance),
                     num_scenes=config.num_scenes,
                     labels=labels,
                     seed=config.seed,
                     num_inference_steps=steps,
-                    guidance_scale=config.guidance_scale,
+                    guidance_scale=guidance,
                     sampler=sampler,
                     noise_scaling=scaling,
                     constraints=config.constraints,
@@ -106,7 +107,7 @@ def sweep_samplers(config: Config) -> list[dict]:
                 made = described(SceneSubset(output, request.source, None, count, "spread"), request.run)
                 scores = compare_datasets(truth, made, dataset.spec.ground_classes)
                 used = storage.read_json(storage.join_uri(output, f"{request.source}.json"))["noise_scaling"]
-                rows.append(make_sampler_row(sampler, steps, used, seconds_per_scene, scores))
+                rows.append(make_sampler_row(sampler, steps, used, seconds_per_scene, scores, guidance))
                 scenes = read_scenes(output, request.source, limit=config.num_examples) if config.num_examples else ()
                 pictures += [Picture(f"{request.run}, {s.frame}", render_bev(s, supersample=2)) for s in scenes]
             for name, control in (("other real scenes (ceiling)", ""), (f"control: {CONTROLS[CONTROL]}", CONTROL)):
@@ -116,10 +117,17 @@ def sweep_samplers(config: Config) -> list[dict]:
         how = [
             f"Real: {count} scenes of {dataset.root}, split {config.real_split}, selected evenly. Model: {model}.",
             f"Ceiling and control: {count_scenes(others)} scenes of split {others.split}, selected evenly.",
-            f"Seed {config.seed}, guidance scale {config.guidance_scale:g}, labels in turn: {', '.join(labels)}.",
+            f"Seed {config.seed}, guidance scale {', '.join(f'{scale:g}' for scale in config.guidance_scale)},"
+            f" labels in turn: {', '.join(labels)}.",
         ]
         write_report(output, rows, pictures, max(1, config.num_examples), how)
         return rows
+
+
+def name_run(config: Config, sampler: str, steps: int, scaling: float | None, guidance: float) -> str:
+    """Return the name of the run of a setting."""
+    name = f"{sampler}-{steps}" + (f"-{scaling:g}" if scaling else "")
+    return name + (f"-guidance-{guidance:g}" if len(config.guidance_scale) > 1 else "")
 
 
 def sample_and_time(config: Config, request: SampleRequest, bar: JobProgress) -> float | None:
@@ -146,7 +154,7 @@ def write_report(output: str, rows: list[dict], pictures: list[Picture], columns
     storage.write_json(rows, storage.join_uri(output, "samplers.json"))
     storage.write_parquet(pa.Table.from_pylist(rows), storage.join_uri(output, "samplers.parquet"))
     storage.write_text(render_sampler_html(rows, pictures, columns, how), storage.join_uri(output, "samplers.html"))
-    for name, chart in zip(CHARTED, draw_sampler_charts(rows), strict=True):
+    for name, chart in draw_sampler_charts(rows).items():
         storage.write_text(make_standalone_svg(chart), storage.join_uri(output, f"samplers-{name}.svg"))
 
 

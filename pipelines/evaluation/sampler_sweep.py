@@ -1,4 +1,7 @@
-"""Build the rows, the table, the charts and the page of `jobs/sweep_samplers.py`, which compares samplers."""
+"""Build the rows, the table, the charts and the page of `jobs/sweep_samplers.py`, which compares samplers.
+
+A setting is a sampler, a number of steps, a noise scaling and a guidance scale.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +23,25 @@ MEASURES = {
     "precision": (("random_precision_k3",), "random-network precision", "high"),
     "recall": (("random_recall_k3",), "random-network recall", "high"),
     "coverage": (("random_coverage_k3",), "random-network coverage", "high"),
+    "lite0_recall": (("lite0_recall_k3",), "lite0 recall", "high"),
+    "lite0_coverage": (("lite0_coverage_k3",), "lite0 coverage", "high"),
+    "vegetation_fidelity": (("label_fidelity", "vegetation_fidelity"), "vegetation label as requested", "high"),
+    "vehicle_fidelity": (("label_fidelity", "vehicle_fidelity"), "vehicle label as requested", "high"),
     "road_connectivity": (("validity", "road_connectivity", "generated"), "road connectivity", "high"),
     "overlapping": (("validity", "overlapping", "generated"), "overlapping objects", "low"),
     "sunken": (("validity", "sunken", "generated"), "sunken objects", "low"),
     "count_ratio": (("count_ratio",), "count ratio of the category whose ratio is farthest from 1", "one"),
 }
 CHARTED = ("relation_frechet", "lite0_frechet", "layout_frechet", "random_frechet", "recall", "road_connectivity")
+# Measures that guidance trades against each other: fidelity to the label, diversity, and distance from the data.
+CHARTED_BY_SCALE = (
+    "vegetation_fidelity",
+    "vehicle_fidelity",
+    "lite0_recall",
+    "lite0_coverage",
+    "relation_frechet",
+    "lite0_frechet",
+)
 COMMON = 3.0  # Minimum number of objects per scene. The ratios of categories with fewer objects vary too much.
 
 
@@ -47,13 +63,18 @@ def compute_deviation(ratio: float) -> float:
 
 
 def make_sampler_row(
-    sampler: str, steps: int | None, noise_scaling: float | None, seconds_per_scene: float | None, scores: Mapping
+    sampler: str,
+    steps: int | None,
+    noise_scaling: float | None,
+    seconds_per_scene: float | None,
+    scores: Mapping,
+    guidance_scale: float | None = None,
 ) -> dict:
     """Make the row of one setting: measures with intervals, and seconds per scene and actor. None means unknown.
 
     The rows of the ceiling and of a control have no steps (None); their `sampler` is a description of the scenes.
     """
-    row = {"sampler": sampler, "steps": steps, "noise_scaling": noise_scaling}
+    row = {"sampler": sampler, "steps": steps, "noise_scaling": noise_scaling, "guidance_scale": guidance_scale}
     row |= {"scenes": scores["scenes"]["generated"], "seconds_per_scene": seconds_per_scene}
     row["count_category"], ratio = compute_count_ratio(scores["statistics"]) or (None, None)
     for name, (place, *_) in MEASURES.items():
@@ -84,8 +105,10 @@ def is_as_good_as(row: Mapping, reference: Mapping) -> bool:
 
 
 def name_settings(row: Mapping) -> str:
-    """Return the name of the sampler; a noise scaling other than 1 is appended."""
-    return row["sampler"] + (f" / {row['noise_scaling']:g}" if row["noise_scaling"] not in (None, 1) else "")
+    """Return the name of the sampler; a noise scaling and a guidance scale other than 1 are appended."""
+    scaling, guidance = row["noise_scaling"], row["guidance_scale"]
+    name = row["sampler"] + (f" / {scaling:g}" if scaling not in (None, 1) else "")
+    return name + (f", guidance {guidance:g}" if guidance not in (None, 1) else "")
 
 
 def select_settings(rows: Iterable[Mapping]) -> list[Mapping]:
@@ -115,7 +138,8 @@ def build_sampler_table(rows: Sequence[Mapping]) -> Table:
     names = [words for _, words, _ in MEASURES.values()]
     alike = f"as good as {name_settings(reference)} with {reference['steps']} steps"
     note = (
-        "A number after / is the noise scaling of a sampler. Brackets contain 95 % bootstrap intervals. Seconds are "
+        "A number after / is the noise scaling of a sampler. Without a guidance scale, guidance is off. Brackets "
+        "contain 95 % bootstrap intervals. Seconds are "
         "measured for one actor with loaded weights. The last column states whether each score is better than "
         f"{name_settings(reference)} with {reference['steps']} steps or within its interval. The ceiling is the score "
         "of the same number of other real scenes; the control damages these scenes."
@@ -125,28 +149,42 @@ def build_sampler_table(rows: Sequence[Mapping]) -> Table:
     )
 
 
-def draw_sampler_charts(rows: Sequence[Mapping]) -> list[Chart]:
-    """Make one chart per measure over the number of steps, with one series per sampler; None values are left out."""
-    charts, rows = [], select_settings(rows)
-    for name in CHARTED:
+def draw_sampler_charts(rows: Sequence[Mapping]) -> dict[str, Chart]:
+    """Make one chart per measure over the number of steps, or over the guidance scale if there are several scales.
+
+    Each chart has one series per setting of the other options. None values are left out.
+
+    Args:
+        rows: Rows of `make_sampler_row`.
+
+    Returns:
+        Charts by measure.
+    """
+    charts, rows = {}, select_settings(rows)
+    by_scale = len({row["guidance_scale"] for row in rows}) > 1
+    axis, words_of_axis = ("guidance_scale", "guidance scale") if by_scale else ("steps", "steps")
+
+    def name_series(row: Mapping) -> str:
+        return (
+            f"{name_settings({**row, 'guidance_scale': 1})}, {row['steps']} steps" if by_scale else name_settings(row)
+        )
+
+    for name in CHARTED_BY_SCALE if by_scale else CHARTED:
         series = {}
-        for sampler in dict.fromkeys(map(name_settings, rows)):
-            points = sorted((r["steps"], r[name]) for r in rows if name_settings(r) == sampler and r[name] is not None)
-            series[sampler] = tuple(map(list, zip(*points, strict=True))) if points else ([], [])
+        for title in dict.fromkeys(map(name_series, rows)):
+            points = sorted((r[axis], r[name]) for r in rows if name_series(r) == title and r[name] is not None)
+            series[title] = tuple(map(list, zip(*points, strict=True))) if points else ([], [])
         words = MEASURES[name][1]
-        charts.append(Chart(words[0].upper() + words[1:], series, "steps", words))
+        charts[name] = Chart(words[0].upper() + words[1:], series, words_of_axis, words)
     return charts
 
 
 def render_sampler_html(rows: Sequence[Mapping], pictures: Sequence[Picture], columns: int, how: Sequence[str]) -> str:
     """Render the page. All rows of `pictures` show the same scenes; `columns` is the number of scenes per row."""
-    note = (
-        "Each row shows scenes that one sampler generated with one number of steps. "
-        "The scene numbers and labels are the same in all rows."
-    )
+    note = "Each row shows scenes of one setting. The scene numbers and labels are the same in all rows."
     sections = [
         build_sampler_table(rows),
-        Charts("Scores by number of steps", draw_sampler_charts(rows)),
+        Charts("Charts", list(draw_sampler_charts(rows).values())),
         Pictures("Generated scenes", pictures, columns, note),
         Text("Method", how),
     ]

@@ -116,6 +116,9 @@ def test_sweep_samplers_scores_each_sampler_and_resumes(smoke, tmp_path):
         sweep_samplers(replace(config, samplers=("euler",)))
     with pytest.raises(ValueError, match=r"--ceiling-split test .* has 16 scenes, but the ceiling needs 20"):
         sweep_samplers(replace(config, real_split="train", num_scenes=20))
+    guided = replace(config, guidance_scale=(1.0, 2.0), num_examples=0, output=str(tmp_path / "guided"))
+    assert [row["guidance_scale"] for row in sweep_samplers(guided)] == [1, 2, None, None]
+    assert "<svg" in (tmp_path / "guided/samplers-vegetation_fidelity.svg").read_text()
 
 
 def test_sample_glb_has_named_node_per_primitive(samples):

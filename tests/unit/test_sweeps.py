@@ -74,9 +74,24 @@ def test_sampler_sweep_compares_with_ddpm_of_most_steps():
     more = [make_row("dpm++", 20, Estimate(2, 1, 3), cars) for cars in (18.0, 22.0, 5.0)]
     assert [is_as_good_as(row, paper) for row in more] == [True, True, False]
     assert [row[-1] for row in build_sampler_table(rows).rows] == ["no", "–", "yes"]
-    (_, _, layout, *_), page = draw_sampler_charts(rows), render_sampler_html(rows, [], 1, ["how"])
+    layout, page = draw_sampler_charts(rows)["layout_frechet"], render_sampler_html(rows, [], 1, ["how"])
     assert layout.series == {"ddpm": ([10, 250], [9.0, 2.0]), "dpm++": ([20], [2.8])}
     assert page.count("<svg") == 6 and "as good as ddpm with 250 steps" in page
     scaled = make_row("ddpm", 500, Estimate(2.0, 1.5, 2.5), scaling=1.01)
     assert find_reference_row([*rows, scaled]) is paper  # the reference row has no noise scaling, as in the paper
     assert build_sampler_table([*rows, scaled]).rows[-1][0] == "ddpm / 1.01"
+
+
+def test_guidance_sweep_charts_fidelity_over_scale():
+    def make_guided(scale: float) -> dict:
+        fidelity = dict.fromkeys(
+            ("vehicle_fidelity", "vehicle_fidelity_low", "vehicle_fidelity_high"), 0.5 + scale / 10
+        )
+        return make_row("dpm++", 20, Estimate(2, 1, 3)) | fidelity | {"guidance_scale": scale}
+
+    rows = [make_guided(4), make_guided(1)]
+    ceiling = make_row("other", 0, Estimate(0, 0, 0)) | {"steps": None}
+    charts = draw_sampler_charts([*rows, ceiling])
+    assert charts["vehicle_fidelity"].series == {"dpm++, 20 steps": ([1, 4], [0.6, 0.9])}
+    assert charts["vehicle_fidelity"].x_label == "guidance scale" and "road_connectivity" not in charts
+    assert [row[0] for row in build_sampler_table(rows).rows] == ["dpm++, guidance 4", "dpm++"]
