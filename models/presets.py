@@ -2,7 +2,8 @@
 
 * `smoke` trains within seconds, for tests.
 * `demo` trains on two CPU cores; the layout VAE takes half an hour and the transformer three hours.
-* `town` has level sets and finer rasters. The layout VAE takes six hours on one CPU core and the transformer longer.
+* `town` has level sets and finer rasters. The layout VAE takes three to four hours on one CPU core and the transformer
+  longer.
 * `kitti360` and `av2` are the paper's models (supplement B.2 and B.3). `kitti360-mini` rehearses them on two cores.
 """
 

@@ -327,7 +327,7 @@ def compute_loss_weight(dit: DiT, timestep: Int[Tensor, " b"], weighting: LossWe
 
     The paper uses "uniform": the squared error of the network output has the same weight at every timestep. "min_snr"
     is the weighting of Hang et al. (2023): the squared error of the clean latent has the weight min(SNR, 5), where SNR
-    is the ratio of signal and noise variance. It prevents that timesteps of little noise dominate the training.
+    is the ratio of signal and noise variance. Timesteps with little noise thus do not dominate the training.
 
     Args:
         dit: Model, which defines the noise schedule.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from jobs.encode_latents import Config as EncodeConfig
 from jobs.evaluate_scenes import Config as EvaluateConfig
-from jobs.implementation.protocols import apply_protocol
+from jobs.implementation.protocols import PROTOCOLS, apply_protocol
 from jobs.inpaint_scenes import Config as InpaintConfig
 from jobs.outpaint_scenes import Config as OutpaintConfig
 from jobs.preprocess_scenes import Av2, Kitti360, Own, Town
@@ -161,6 +161,14 @@ def check_evaluate_scenes(config: EvaluateConfig) -> None:
     for name, least in (("num_examples", 0), ("max_scenes", 2), ("supersample", 1), ("guess_scenes", 0)):
         if (value := getattr(config, name)) is not None and value < least:
             raise ValueError(f"--{name.replace('_', '-')} is {value}, expected {least} or more")
+    if config.guess_scenes:
+        pictures = [path for path in (config.real, config.generated) if path.endswith(".npz")]
+        if pictures:
+            raise ValueError(f"--guess-scenes draws scenes, but {pictures[0]} contains pictures; omit the option")
+        if config.protocol and PROTOCOLS[config.protocol].is_streamed:
+            raise ValueError(f"--guess-scenes is not available with --protocol {config.protocol}; omit one of them")
+        if config.lvae and not (config.generated or config.run or config.generated_source):
+            raise ValueError("--guess-scenes needs generated scenes; add --generated, --run or --generated-source")
     if config.max_reconstructed_scenes is not None and not config.lvae:
         raise ValueError("--max-reconstructed-scenes needs --lvae; --max-scenes limits the generated scenes")
     if config.inception and not storage.exists(make_absolute(config.inception)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 from rich.console import Console
 from rich.table import Table
@@ -181,22 +182,15 @@ def evaluate_generation(
 
 
 def write_guess_page(sides: dict[str, SceneSet], count: int, path: str, bar: JobProgress) -> None:
-    """Write a page with `count` evenly spread real scenes and as many generated scenes in random order.
+    """Write a page with `count` evenly spread real scenes and as many generated scenes in random order."""
 
-    Raises:
-        ValueError: A side consists of pictures, not of scenes.
-    """
-    chosen: dict[str, list[Scene]] = {}
-    for name in ("real", "generated"):
-        side = sides[name]
-        if not isinstance(side, SceneSubset):
-            raise ValueError(f"--guess-scenes draws scenes, but the {name} side is a file of pictures; omit it")
-        selected = replace(side, limit=min(count, count_scenes(side)), pick="spread")
-        chosen[name] = [scene for shard, rows in selected.shards() for scene in shard.scenes(rows)]
-    task = bar.add_task("draw guess.html", total=sum(map(len, chosen.values())))
-    html = render_guess_html(
-        chosen["real"], chosen["generated"], "Real or generated?", on_scene=lambda: bar.advance(task)
-    )
+    def read(side: SceneSet) -> list[Scene]:
+        selected = replace(cast(SceneSubset, side), limit=min(count, count_scenes(side)), pick="spread")
+        return [scene for shard, rows in selected.shards() for scene in shard.scenes(rows)]
+
+    real, generated = read(sides["real"]), read(sides["generated"])
+    task = bar.add_task("draw guess.html", total=len(real) + len(generated))
+    html = render_guess_html(real, generated, "Real or generated?", on_scene=lambda: bar.advance(task))
     storage.write_text(html, path)
 
 

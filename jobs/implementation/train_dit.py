@@ -81,14 +81,16 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     record = trainer.guard_run_name(name, home_path("runs"), identity)
     tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
     execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
-    timesteps = parse_timestep_sampling(config), parse_loss_weighting(config)
+    timestep_sampling, loss_weighting = parse_timestep_sampling(config), parse_loss_weighting(config)
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
     check_training_labels(shards, label_kind)
     training = TrainingRun(
         name=name,
         storage_path=home_path("runs"),
-        build=partial(build, architecture, settings, execution, row.label_dropout, start, *timesteps),
+        build=partial(
+            build, architecture, settings, execution, row.label_dropout, start, timestep_sampling, loss_weighting
+        ),
         stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
         reader=LatentReader(latents_root, label_kind),
         settings=settings,

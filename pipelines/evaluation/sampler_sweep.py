@@ -104,11 +104,15 @@ def is_as_good_as(row: Mapping, reference: Mapping) -> bool:
     return all(good(name, better) for name, (_, _, better) in MEASURES.items())
 
 
+def name_sampler(row: Mapping) -> str:
+    """Return the name of the sampler; a noise scaling other than 1 is appended."""
+    return row["sampler"] + (f" / {row['noise_scaling']:g}" if row["noise_scaling"] not in (None, 1) else "")
+
+
 def name_settings(row: Mapping) -> str:
-    """Return the name of the sampler; a noise scaling and a guidance scale other than 1 are appended."""
-    scaling, guidance = row["noise_scaling"], row["guidance_scale"]
-    name = row["sampler"] + (f" / {scaling:g}" if scaling not in (None, 1) else "")
-    return name + (f", guidance {guidance:g}" if guidance not in (None, 1) else "")
+    """Return the name of the sampler as `name_sampler`; a guidance scale other than 1 is appended."""
+    guidance = row["guidance_scale"]
+    return name_sampler(row) + (f", guidance {guidance:g}" if guidance not in (None, 1) else "")
 
 
 def select_settings(rows: Iterable[Mapping]) -> list[Mapping]:
@@ -139,8 +143,8 @@ def build_sampler_table(rows: Sequence[Mapping]) -> Table:
     alike = f"as good as {name_settings(reference)} with {reference['steps']} steps"
     note = (
         "A number after / is the noise scaling of a sampler. Without a guidance scale, guidance is off. Brackets "
-        "contain 95 % bootstrap intervals. Seconds are "
-        "measured for one actor with loaded weights. The last column states whether each score is better than "
+        "contain 95 % bootstrap intervals. Seconds are measured for one actor with loaded weights. The last column "
+        "states whether each score is better than "
         f"{name_settings(reference)} with {reference['steps']} steps or within its interval. The ceiling is the score "
         "of the same number of other real scenes; the control damages these scenes."
     )
@@ -162,12 +166,10 @@ def draw_sampler_charts(rows: Sequence[Mapping]) -> dict[str, Chart]:
     """
     charts, rows = {}, select_settings(rows)
     by_scale = len({row["guidance_scale"] for row in rows}) > 1
-    axis, words_of_axis = ("guidance_scale", "guidance scale") if by_scale else ("steps", "steps")
+    axis, x_label = ("guidance_scale", "guidance scale") if by_scale else ("steps", "steps")
 
     def name_series(row: Mapping) -> str:
-        return (
-            f"{name_settings({**row, 'guidance_scale': 1})}, {row['steps']} steps" if by_scale else name_settings(row)
-        )
+        return f"{name_sampler(row)}, {row['steps']} steps" if by_scale else name_settings(row)
 
     for name in CHARTED_BY_SCALE if by_scale else CHARTED:
         series = {}
@@ -175,7 +177,7 @@ def draw_sampler_charts(rows: Sequence[Mapping]) -> dict[str, Chart]:
             points = sorted((r[axis], r[name]) for r in rows if name_series(r) == title and r[name] is not None)
             series[title] = tuple(map(list, zip(*points, strict=True))) if points else ([], [])
         words = MEASURES[name][1]
-        charts[name] = Chart(words[0].upper() + words[1:], series, words_of_axis, words)
+        charts[name] = Chart(words[0].upper() + words[1:], series, x_label, words)
     return charts
 
 

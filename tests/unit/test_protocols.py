@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jobs.evaluate_scenes import Config
+from jobs.implementation.checks import check_evaluate_scenes
 from jobs.implementation.protocols import PROTOCOLS, apply_protocol
 from pipelines.evaluation.evaluate import estimate_frechet, score_nearest_distances
 from pipelines.evaluation.features import (
@@ -53,6 +54,20 @@ def test_protocol_sets_its_options():
 def test_conflicting_option_is_an_error_that_names_both(options, message):
     with pytest.raises(ValueError, match=message):
         apply_protocol(Config(**options))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"generated": "samples.npz"}, "--guess-scenes draws scenes, but samples.npz contains pictures"),
+        ({"protocol": "paper-fid"}, "--guess-scenes is not available with --protocol paper-fid"),
+        ({"lvae": "town"}, "--guess-scenes needs generated scenes; add --generated"),
+        ({"guess_scenes": -1}, "--guess-scenes is -1, expected 0 or more"),
+    ],
+)
+def test_guess_page_needs_scenes_of_both_sides(options, message):
+    with pytest.raises(ValueError, match=message):
+        check_evaluate_scenes(Config(**{"guess_scenes": 4} | options))
 
 
 def test_blank_pictures_are_found_and_dropped(tmp_path):

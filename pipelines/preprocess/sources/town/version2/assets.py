@@ -13,7 +13,7 @@ from pipelines.preprocess.sources.town.version2.districts import District, Varia
 ALIGNED = 0.75  # Share of ellipsoids whose axes are parallel to the street.
 CLUSTER_M = 1.3  # Spread of the plants of a cluster.
 PLANTS_PER_CLUSTER = 1.2
-PLANT_CHOICES = 4  # Each plant takes the place of so many that is farthest from the plants before it.
+CANDIDATES_PER_PLANT = 4  # Number of places of which a plant takes the one farthest from other plants.
 WALL_LABELS = ("wall", "fence", "gate", "guardrail")
 WALL_SHARES = (0.6, 0.29, 0.09, 0.02)
 
@@ -64,7 +64,7 @@ def scatter_plants(
     """Return free places (s, t) of at most `count` plants, about mean_t from the front and apart from `planted`."""
     rng = site.rng
     clusters = max(1, round(count / PLANTS_PER_CLUSTER))
-    place = rng.integers(0, clusters, PLANT_CHOICES * (count + 2))
+    place = rng.integers(0, clusters, CANDIDATES_PER_PLANT * (count + 2))
     s = rng.uniform(0.2, max(0.3, width - 0.2), clusters)[place] + CLUSTER_M * rng.standard_normal(len(place))
     t = rng.gamma(1.8, mean_t / 1.8, clusters)[place] + CLUSTER_M * rng.standard_normal(len(place))
     inside = (s > 0.2) & (s < width - 0.2) & (t > 0.4) & (t < depth - 0.2)
@@ -118,12 +118,12 @@ def plant_garden(
             continue
         kind = "shrub" if what == "shrub" else "ellipsoid"
         places = scatter_plants(site, width, depth, count, mean_t, taken, planted[kind])
+        if not len(places):
+            continue
         planted[kind] = np.concatenate([planted[kind], places])
         s, t = places.T
         if what != "shrub":
             add_ellipsoids(site, frame, s, t, what)
-            continue
-        if not len(s):
             continue
         scale = np.where(rng.random((len(s), 1)) < 0.08, 1.7, 1.0) * np.array([1.0, 0.93, 1.0])
         size = draw_sizes(rng, "shrub", len(s), scale)
