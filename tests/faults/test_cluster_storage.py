@@ -134,6 +134,7 @@ def test_chain_on_s3_survives_loss_of_a_node(s3, folder, cluster, tmp_path, monk
     assert tables == {name: chaos.digest_file(local[0], f"{local[1]}/{name}") for name in tables}
 
 
+@pytest.mark.slow
 def test_three_kills_leave_the_tables_unchanged(s3, tmp_path):
     store, _ = s3
     chaos.restore_raylets(store.cluster)
