@@ -10,6 +10,7 @@ import shapely
 from jobs.implementation.checks import check_preprocess_scenes
 from jobs.implementation.preprocess_scenes import make_recorded_options, plan_shards
 from jobs.preprocess_scenes import Town
+from models.geometry.iou3d import compute_iou3d_pairs, find_overlapping_bounds, make_boxes
 from models.layout import SLAB_OFFSET_M
 from models.scene import CATEGORY_INDEX
 from pipelines.metrics.relations import RELATIONS, compute_scene_relations, find_support, fuse_ground, measure_objects
@@ -118,14 +119,39 @@ def test_some_buildings_touch_neighbours(towns):
 
 
 def test_buildings_stand_on_lowest_corner(towns):
-    """Buildings are sunk by the relief under their footprint, and by at most a constant depth."""
+    """Buildings are sunk by the relief under their footprint, and by a random depth of at most 1.6 m."""
     drive = towns[1]
     for index in range(0, 200, 25):
         scene = drive.scene(index)
         height_m, classes = fuse_ground(scene)
         gap = measure_objects(scene, SLAB_OFFSET_M, height_m, classes).gap_m[scene.category == BUILDING]
         gap = gap[np.isfinite(gap)]
-        assert (gap < 0.05).all() and (gap > -1.2).all()
+        assert (gap < 0.05).all() and (gap > -2.7).all()
+
+
+def test_walls_and_people_do_not_overlap_their_kind(towns):
+    for drive in towns:
+        static = drive.timestamp == STATIC
+        for name in ("construction_small", "human", "two_wheelers", "object"):
+            index = np.flatnonzero(static & (drive.category == CATEGORY_INDEX[name]))
+            boxes = make_boxes(drive.center_m[index], drive.rotation[index], drive.size_m[index])
+            i, j = find_overlapping_bounds(boxes, boxes)
+            i, j = i[i < j], j[i < j]
+            assert compute_iou3d_pairs(boxes.take(i), boxes.take(j)).max(initial=0) <= 0.15
+            assert len(index) > 10 or name in ("human", "two_wheelers")
+
+
+def test_objects_are_sunk_like_annotations(towns):
+    """In the first half of the KITTI-360 excerpt, poles are sunk by 0.04 to 0.21 m (2 % and 98 % quantiles)."""
+    gaps = []
+    for drive in towns:
+        for index in range(0, 200, 25):
+            scene = drive.scene(index)
+            height_m, classes = fuse_ground(scene)
+            gap_m = measure_objects(scene, SLAB_OFFSET_M, height_m, classes).gap_m
+            gaps.append(gap_m[scene.category == CATEGORY_INDEX["pole"]])
+    low, middle, high = np.nanquantile(np.concatenate(gaps), [0.02, 0.5, 0.98])
+    assert -0.3 < low < -0.18 and middle == pytest.approx(-0.14, abs=0.03) and -0.1 < high < 0.02
 
 
 def test_signs_and_lamps_have_support(towns):

@@ -20,6 +20,7 @@ VERGE_M = (2.2, 3.6)  # Depth of a verge with a path, which takes the place of a
 PATH_M = 1.1  # Width of this path.
 BAY_DEPTH_M = 2.3
 POLE_SPREAD_RAD = 0.2  # Boxes of poles are annotated along or across the street, with this spread.
+SIGN_OFFSET_M = 0.03  # Standard deviation of the distance between the centres of a sign and its pole, per axis.
 NARROW_M = 2.9  # In streets with a smaller half width, cars stand on one side only.
 MIN_CORNER_WALK_M = 0.7  # Least distance of the inner corner of a sidewalk from the kerb, along each street.
 
@@ -250,9 +251,9 @@ def _add_lamps(site: Site, frame: LocalFrame, s: np.ndarray, t: float) -> None:
     site.sheet.boxes(frame, "bigPole", s, t, pole, draw_yaw(site.rng, len(s), POLE_SPREAD_RAD))
     lit = site.rng.random(len(s)) < site.district.lamps
     head = draw_sizes(site.rng, "lamp", len(s))
-    site.sheet.boxes(
-        frame, "lamp", s[lit], t - 0.35, head[lit], draw_yaw(site.rng, int(lit.sum())), pole[lit, 2] - 0.25
-    )
+    count = int(lit.sum())
+    out = site.rng.uniform(0.2, 0.45, count)  # Distance from the pole towards the street.
+    site.sheet.boxes(frame, "lamp", s[lit], t - out, head[lit], draw_yaw(site.rng, count), pole[lit, 2] - 0.4)
 
 
 def _add_sign(site: Site, frame: LocalFrame, s: float, t: float) -> None:
@@ -265,14 +266,17 @@ def _add_sign(site: Site, frame: LocalFrame, s: float, t: float) -> None:
     bottom = pole[2] - 0.1
     for _ in range(1 + (rng.random() < 0.2)):  # The second sign is below the first one.
         sign = draw_sizes(rng, "trafficSign", 1)[0]
-        site.sheet.boxes(frame, "trafficSign", s, t, sign, draw_yaw(rng, 1), bottom)
+        ds, dt = rng.normal(0, SIGN_OFFSET_M, 2)
+        site.sheet.boxes(frame, "trafficSign", s + ds, t + dt, sign, draw_yaw(rng, 1), bottom)
         bottom -= sign[2] + 0.05
 
 
 def _add_lights(site: Site, frame: LocalFrame, s: float, t: float) -> None:
     """Add a pole with two traffic lights."""
     pole = draw_sizes(site.rng, "bigPole", 1, 0.75)[0]
-    pole[2] = max(3.4, pole[2])
-    site.sheet.boxes(frame, "smallPole", s, t, pole, draw_yaw(site.rng, 1, POLE_SPREAD_RAD))
     lights = draw_sizes(site.rng, "trafficLight", 2)
-    site.sheet.boxes(frame, "trafficLight", [s] * 2, [t] * 2, lights, draw_yaw(site.rng, 2), np.array([2.2, 2.9]))
+    second = 2.25 + lights[0, 2]
+    pole[2] = max(3.4, second, pole[2])
+    site.sheet.boxes(frame, "smallPole", s, t, pole, draw_yaw(site.rng, 1, POLE_SPREAD_RAD))
+    ds, dt = site.rng.normal(0, SIGN_OFFSET_M, (2, 2))
+    site.sheet.boxes(frame, "trafficLight", s + ds, t + dt, lights, draw_yaw(site.rng, 2), np.array([2.2, second]))

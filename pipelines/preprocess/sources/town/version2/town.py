@@ -10,8 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from models.geometry.iou3d import compute_iou3d_pairs, find_overlapping_bounds, make_boxes
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES
-from pipelines.preprocess.sources.drive import Drive, SlabGround
+from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
 from pipelines.preprocess.sources.town.districts import TOWN_KINDS
 from pipelines.preprocess.sources.town.land import Land, draw_land
 from pipelines.preprocess.sources.town.streets import (
@@ -46,7 +47,22 @@ CORNER_M = (3.5, 7.5)  # Radius of kerbs.
 SKEWED = 0.7  # Share of towns whose streets do not cross at right angles.
 MAX_SKEW = 0.3  # Largest tangent of the deviation from a right angle.
 SKEW_WAVE_M = 4000.0
-SUNK_M = 0.1  # Depth of a building below the lowest point of the surface under its walls.
+SUNK_M = 0.1  # Least depth of a building below the lowest point of the surface under its walls.
+# Depth of objects below the surface (m): mean, standard deviation, and limits, as in the first half of the KITTI-360
+# excerpt. Its annotations hold no people and two-wheelers.
+DEPTH_M = {
+    "vegetation_cuboid": (0.2, 0.3, (-0.2, 1.2)),
+    "construction_big": (0.25, 0.35, (0.0, 1.5)),
+    "construction_small": (0.3, 0.3, (0.0, 1.2)),
+    "pole": (0.14, 0.05, (0.0, 0.3)),
+    "object": (0.12, 0.12, (0.0, 0.45)),
+    "two_wheelers": (0.03, 0.03, (0.0, 0.1)),
+    "human": (0.03, 0.03, (0.0, 0.1)),
+    "vehicle_small": (0.0, 0.02, (-0.03, 0.03)),
+    "vehicle_big": (0.0, 0.02, (-0.03, 0.03)),
+}
+MAX_IOU3D = 0.15  # Of two walls, people, two-wheelers or objects with a higher IoU3D, the second one is removed.
+APART = [CATEGORY_INDEX[name] for name in ("construction_small", "human", "two_wheelers", "object")]
 FREE_CROP_M = 64.0  # Side of the crop ahead of a free pose.
 FREE_MARGIN_M = 14.0  # Largest distance of the corners of a free crop from the outermost streets.
 MAX_TRIES = 10_000
@@ -88,6 +104,7 @@ def make_town(seed: int, num_free_poses: int = 0) -> Drive:
     place_traffic(sheet, rng, route, at, frame)
     ground = collect_ground(sheet, land)
     boxes = _settle_boxes(collect_boxes(sheet, rng, land), ground, land)
+    boxes = _remove_overlapping(_sink_boxes(boxes, np.random.default_rng([7304, seed])))
     free = _draw_free_poses(np.random.default_rng([7303, seed]), streets, land, num_free_poses)
     return Drive(
         source="town",
@@ -166,6 +183,29 @@ def _settle_boxes(boxes: dict[str, np.ndarray], ground: SlabGround, land: Land) 
     keep[loose[find_covered(center[loose, :2], center[standing, :2], axis[kept], size[standing, :2])]] = False
     boxes = boxes | {"center_m": center, "size_m": size}
     return {name: values[keep] for name, values in boxes.items()}
+
+
+def _remove_overlapping(boxes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Remove static objects that overlap an earlier object of their category."""
+    index = np.flatnonzero(np.isin(boxes["category"], APART) & (boxes["timestamp"] == STATIC))
+    shapes = make_boxes(*(boxes[name][index] for name in ("center_m", "rotation", "size_m")))
+    i, j = find_overlapping_bounds(shapes, shapes)
+    both = (i < j) & (boxes["category"][index[i]] == boxes["category"][index[j]])
+    i, j = i[both], j[both]
+    hit = compute_iou3d_pairs(shapes.take(i), shapes.take(j)) > MAX_IOU3D
+    keep = np.ones(len(boxes["category"]), bool)
+    for first, second in zip(index[i[hit]].tolist(), index[j[hit]].tolist(), strict=True):
+        keep[second] &= not keep[first]
+    return {name: values[keep] for name, values in boxes.items()}
+
+
+def _sink_boxes(boxes: dict[str, np.ndarray], rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Lower the objects by random depths (DEPTH_M)."""
+    center_m = boxes["center_m"].copy()
+    for name, (mean, spread, limits) in DEPTH_M.items():
+        chosen = (boxes["category"] == CATEGORY_INDEX[name]) & (boxes["timestamp"] == STATIC)
+        center_m[chosen, 2] -= rng.normal(mean, spread, chosen.sum()).clip(*limits)
+    return boxes | {"center_m": center_m}
 
 
 # ---------------------------------------------------------------- free poses
