@@ -71,7 +71,12 @@ SMOKE = LayoutVAEConfig(4, GroundConfig((8, 16, 16), 4), ObjectConfig(32, 1, 2, 
 SMALL_CELLS = ObjectConfig(128, 2, 4, 256, 256, decoder="cells", min_proposals_per_cell=3, loss_unit="cells")
 PAPER_CELLS = replace(PAPER.objects, decoder="cells", min_proposals_per_cell=3, loss_unit="cells")
 DEMO = LayoutVAEConfig(16, GroundConfig((32, 64), 8, 4, attention=False), SMALL_CELLS, shortcut=True)
-TOWN = LayoutVAEConfig(16, GroundConfig((32, 64), 8, 4, attention=False, level_sets=True), SMALL_CELLS, shortcut=True)
+TOWN = LayoutVAEConfig(
+    16,
+    GroundConfig((32, 64), 8, 4, attention=False, level_sets=True),
+    replace(SMALL_CELLS, order_in_cell=True),
+    shortcut=True,
+)
 PIXELS = LayoutVAEConfig(32, GroundConfig((32,), 8, 8, attention=False), SMALL_CELLS, shortcut=True)
 MINI = LayoutVAEConfig(32, GroundConfig((8, 16, 32, 64), 4), ObjectConfig(128, 3, 4, 256, 256))
 

@@ -43,6 +43,7 @@ OBJECT_RULES: dict[str, Rule] = {
     "position_unit": Choice(POSITION_UNITS),
     "auxiliary_losses": Flag(),
     "denoising_groups": Integer(0, 100),
+    "order_in_cell": Flag(),
 }
 
 
@@ -96,6 +97,8 @@ class ObjectConfig:
         auxiliary_losses: If True, each layer of the decoder has a loss in training.
         denoising_groups: Number of groups of denoising queries in training; 0: none. Each layer has a centre and a
             Cholesky loss for them, without an existence loss.
+        order_in_cell: If True, the encoder knows the order of the primitives within each cell, and the value of a cell
+            is the sum of their features. Otherwise, it is the mean, as in the paper.
     """
 
     width: int = 512
@@ -111,6 +114,7 @@ class ObjectConfig:
     position_unit: str = "map"
     auxiliary_losses: bool = False
     denoising_groups: int = 0
+    order_in_cell: bool = False
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ In shapes, N is the number of slots of all categories, d the width, and (h, w) t
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from models.base import apply_in_float32, register_computed_buffers
@@ -19,6 +20,7 @@ from models.vae.config import ObjectConfig
 from models.vae.transformer import EncoderLayer
 
 CATEGORY_EMBEDDING = 10  # 9 features + 10 embedding channels + 1 padding flag = 20 inputs (paper, Sec. 3.2).
+ORDERS = 4  # Orders within a cell that `order_in_cell` distinguishes. Later primitives have the last order.
 
 
 def find_grid_cells(centers: Float[Tensor, "batch n 3"], rows: int, cols: int) -> tuple[Tensor, Tensor]:
@@ -39,11 +41,29 @@ def find_grid_cells(centers: Float[Tensor, "batch n 3"], rows: int, cols: int) -
     return row, col
 
 
+def count_earlier_in_cell(cell: Int[Tensor, "batch n"], real: Bool[Tensor, "batch n"]) -> Int[Tensor, "batch n"]:
+    """Count the real primitives before each primitive that lie in the same cell.
+
+    Args:
+        cell: Index of the cell of each primitive.
+        real: True for each slot that holds a primitive.
+
+    Returns:
+        Number of earlier primitives in the same cell.
+    """
+    earlier = (cell[:, :, None] == cell[:, None]) & real[:, None]
+    return earlier.tril(-1).sum(dim=2)
+
+
 class ObjectEncoder(nn.Module):
     """Encode primitives to mean and log-variance of the object latent.
 
     The value of a cell is a learned value plus the mean of the features of its primitives. Padded slots are masked in
     the attention and are not written to the latent grid.
+
+    With `order_in_cell`, the value is the sum of the features, and the order of a primitive within its cell is an
+    additional input. Primitives of the same cell can thus use different directions of the latent space. The mean of two
+    primitives often decodes to one primitive between them. The paper uses the mean.
 
     With `shortcut`, a small network computes an additional term of the mean from each primitive. The inputs of the
     small network are the position in the cell, the shape and the category of the primitive. The shortcut avoids the
@@ -64,16 +84,17 @@ class ObjectEncoder(nn.Module):
         width, heads, hidden = config.width, config.heads, config.hidden
         self.slots = tuple(slots)
         self.slot_multiple = 1  # Compiled layers need few different numbers of slots.
+        self.orders = ORDERS if config.order_in_cell else 0
         register_computed_buffers(self)
         self.category = nn.Embedding(len(slots), CATEGORY_EMBEDDING)
-        self.project_in = nn.Linear(FEATURES + CATEGORY_EMBEDDING + 1, width)
+        self.project_in = nn.Linear(FEATURES + CATEGORY_EMBEDDING + 1 + self.orders, width)
         self.layers = nn.ModuleList(EncoderLayer(width, heads, hidden) for _ in range(config.layers))
         self.project_out = nn.Linear(width, 2 * latent_channels)
         self.grid = nn.Parameter(torch.zeros(2 * latent_channels, latent_size, latent_size))
         self.shortcut = None
         if shortcut:
             self.shortcut = nn.Sequential(
-                nn.Linear(FEATURES + CATEGORY_EMBEDDING, width),
+                nn.Linear(FEATURES + CATEGORY_EMBEDDING + self.orders, width),
                 nn.SiLU(),
                 nn.Linear(width, width),
                 nn.SiLU(),
@@ -101,8 +122,13 @@ class ObjectEncoder(nn.Module):
         features, real, category = self.drop_padding(features, real)
         batch = len(features)
         moments, rows, cols = self.grid.shape
-        category = self.category(category)  # (b, n, 10)
-        x = torch.cat([features, category, real[..., None].to(features.dtype)], dim=-1)  # (b, n, 20)
+        row, col = find_grid_cells(features[..., :3], rows, cols)
+        cell = row * cols + col  # (b, n)
+        known = self.category(category)  # (b, n, 10)
+        if self.orders:
+            order = count_earlier_in_cell(cell, real).clamp(max=self.orders - 1)
+            known = torch.cat([known, F.one_hot(order, self.orders).to(known.dtype)], dim=-1)  # (b, n, 14)
+        x = torch.cat([features, known, real[..., None].to(features.dtype)], dim=-1)  # (b, n, 20 or 24)
         x = apply_in_float32(self.project_in, x)  # (b, n, d)
         # Attention needs at least one visible token, also in a scene without primitives. The first slot is therefore
         # visible, but if it is padding, it is not written to the latent grid.
@@ -111,34 +137,32 @@ class ObjectEncoder(nn.Module):
         for layer in self.layers:
             x = layer(x, visible)
         x = apply_in_float32(self.project_out, x)  # (b, n, moments)
-        row, col = find_grid_cells(features[..., :3], rows, cols)
         if self.shortcut is not None:
             mean, logvar = x.chunk(2, dim=-1)
-            added = apply_in_float32(self.shortcut, self.encode_in_cell(features, row, col, category))
+            added = apply_in_float32(self.shortcut, self.encode_in_cell(features, row, col, known))
             x = torch.cat([mean + added, logvar], dim=-1)
         x = x * real[..., None]
-        cell = row * cols + col  # (b, n)
         total = x.new_zeros(batch, rows * cols, moments).scatter_add_(1, cell[..., None].expand(-1, -1, moments), x)
-        count = x.new_zeros(batch, rows * cols).scatter_add_(1, cell, real.to(x.dtype))
-        mean = total / count.clamp(min=1)[..., None]
-        return self.grid + mean.transpose(1, 2).unflatten(2, (rows, cols))
+        if not self.orders:
+            count = x.new_zeros(batch, rows * cols).scatter_add_(1, cell, real.to(x.dtype))
+            total = total / count.clamp(min=1)[..., None]
+        return self.grid + total.transpose(1, 2).unflatten(2, (rows, cols))
 
-    def encode_in_cell(self, features: Tensor, row: Tensor, col: Tensor, category: Tensor) -> Tensor:
+    def encode_in_cell(self, features: Tensor, row: Tensor, col: Tensor, known: Tensor) -> Tensor:
         """Compute the input of the shortcut.
 
         Args:
             features: (b, n, 9) normalised features.
             row: (b, n) row of each primitive's cell.
             col: (b, n) column of each primitive's cell.
-            category: (b, n, 10) category embeddings.
+            known: (b, n, k) category embeddings, and the order if the encoder knows it.
 
         Returns:
-            (b, n, 19): x and y relative to the cell centre (in cells), other features scaled to [-2, 2], category
-            embedding.
+            (b, n, 9 + k): x and y relative to the cell centre (in cells), other features scaled to [-2, 2], `known`.
         """
         _, rows, cols = self.grid.shape
         down, right = (1 - features[..., 0]) * rows - row - 0.5, (1 - features[..., 1]) * cols - col - 0.5
-        return torch.cat([down[..., None], right[..., None], 4 * features[..., 2:] - 2, category], dim=-1)
+        return torch.cat([down[..., None], right[..., None], 4 * features[..., 2:] - 2, known], dim=-1)
 
     def drop_padding(self, features: Tensor, real: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Move real primitives to the front, and remove trailing slots that are padding in all samples.

@@ -36,6 +36,7 @@ from models.vae.losses import (
     compute_occupancy_loss,
 )
 from models.vae.matching import MatchWeights, match_primitives
+from models.vae.objects import count_earlier_in_cell
 from models.vae.outputs import Posterior
 from models.vae.transformer import EncoderLayer
 
@@ -188,6 +189,28 @@ def test_object_shortcut_is_equivariant_to_cell_shift():
         here, there = encoder(features, real)[:, :4] - encoder.grid[:4]
     assert here[:, 5, 5].abs().max() > 0.01 and here.count_nonzero() == 4 == there.count_nonzero()
     assert torch.allclose(here[:, 5, 5], there[:, 3, 6], atol=1e-5)
+
+
+def test_order_in_cell_separates_primitives_of_a_cell():
+    """Without the order, the value of a cell is a mean; with it, it is a sum that depends on the order."""
+    cell = torch.tensor([[3, 5, 3, 3, 5, 3]])
+    real = torch.tensor([[True, True, False, True, True, True]])
+    assert count_earlier_in_cell(cell, real).tolist() == [[0, 0, 1, 1, 1, 2]]
+    features = torch.full((2, sum(small_spec().slots), 9), 0.3)
+    real = torch.zeros(features.shape[:2], dtype=torch.bool)
+    real[0, 0] = True
+    real[1, :2] = True  # The second scene has a copy of the primitive in the same cell.
+    for ordered in (False, True):
+        encoder = make_small_lvae(shortcut=True, objects={"order_in_cell": ordered}).object_encoder
+        for layer in encoder.layers:  # Without attention, the value of a primitive does not depend on the other one.
+            torch.nn.init.zeros_(layer.attention.out.weight)
+            torch.nn.init.zeros_(layer.attention.out.bias)
+        with torch.no_grad():
+            one, two = (encoder(features, real) - encoder.grid)[:, :4, 5, 5]
+        if ordered:
+            assert (two - one).norm() > 0.1 * one.norm() and not torch.allclose(two, 2 * one, rtol=0.05)
+        else:
+            assert torch.allclose(one, two, atol=1e-5)
 
 
 def test_init_from_data_starts_outputs_at_means():
