@@ -13,9 +13,9 @@
 
 The job reads only the scene tables. If --lvae is given and none of --generated, --run and --generated-source is given,
 the job evaluates only the reconstruction. From an .npz file, the job uses the first --max-scenes pictures. The defaults
-are the paper's: k = 3, and at most 1,000 training scenes, selected by farthest point sampling of poses. The job
-compares N real scenes with N generated scenes. Each label has the same share of the generated scenes. Every score has a
-95 % confidence interval over scenes.
+are the paper's: k = 3, and at most 1,000 training scenes, selected by farthest point sampling of poses. Except
+with --protocol pdd, the job compares N real scenes with N generated scenes. By default, all labels have equally many
+generated scenes. Scores have 95 % confidence intervals over scenes; that of the two-sample AUC is over places.
 
 Every score stands next to its ceiling: the same score of N other real scenes. With --controls, the job also scores
 damaged copies of these scenes: objects moved, turned, permuted, dropped, duplicated or from another scene, and ground

@@ -60,7 +60,8 @@ class Config:
     gpus: GpusOption = None
     wait_for_resources_s: WaitForResourcesOption = 0.0
     batch_size: int = 8
-    """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding."""
+    """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding, except in
+    rare cases with --constraints."""
     precision: Literal["fp32", "bf16"] = "fp32"
     """Precision of the transformer. bf16 is faster on GPUs and changes scenes by rounding."""
     cuda_graphs: bool = False

@@ -50,7 +50,8 @@ class Config:
     """Classifier-free guidance scales to compare; 1 switches guidance off."""
     constraints: ConstraintsOption = None
     batch_size: int = 8
-    """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding."""
+    """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding, except in
+    rare cases with --constraints."""
     num_examples: int = 4
     """Number of scenes per setting that the page shows."""
     output: str = ""

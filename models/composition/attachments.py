@@ -1,9 +1,9 @@
 """Attach signs, lamps and signals of decoded scenes to what carries them, and put poles on the ground.
 
-A decoder places each object separately, so a sign may hang in the air next to its pole. In 256 test scenes of the town,
-99.7 % of the signs touch a pole, a wall or a building, and all poles stand on ground. Decoded scenes are therefore
-completed: each sign is assigned to its most plausible supporter and moved until both touch. A pole that the decoder
-proposes with a low existence probability becomes part of the scene if it is the most plausible supporter.
+A decoder places each object separately, so a sign may hang in the air next to its pole. In 256 test scenes of town
+version 1, 99.7 % of the signs touch a pole, a wall or a building, and all poles stand on ground. Decoded scenes are
+therefore completed: each sign is assigned to its most plausible supporter and moved until both touch. A pole that the
+decoder proposes with a low existence probability becomes part of the scene if it is the most plausible supporter.
 
 The paper does not resolve attachments. It lists floating signs among its failures.
 """
@@ -37,7 +37,7 @@ class AttachmentReport:
     """Counts of changes in scenes.
 
     Attributes:
-        lowered: Poles that were put on the ground.
+        lowered: Poles that stood on nothing. Those without ground within STEP_M are counted but not moved.
         moved: Signs that were moved to a supporter.
         added: Poles that were added because a sign needs them.
         unsupported: Signs without a supporter in range, which are kept.

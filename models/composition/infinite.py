@@ -23,8 +23,8 @@ from models.scene import Grid, Scene
 class InfiniteScene:
     """An unbounded scene of blocks with four ranks (`outpaint.rank_four_colors`).
 
-    Each block depends on at most eight neighbours and on block (0, 0). Block (0, 0) sets the ground height. Generated
-    blocks are kept in memory until `drop_block` is called.
+    Each block directly depends on at most eight neighbours and on block (0, 0). Block (0, 0) sets the ground height.
+    Generated blocks are kept in memory until `drop_block` is called.
 
     Args:
         model: A PrITTIPipeline.

@@ -50,7 +50,7 @@ class ConstraintConfig:
         weights: Weight of each constraint by name; a missing weight is 1. The defaults are from a comparison on the
             released model (docs/experiments/constraints.md).
         last: Share of the denoising steps, from the end, in which sampling is guided.
-        every: One of this number of steps is guided; the last step always is.
+        every: Guide every n-th step of the guided part, counted from the last step, which is always guided.
         iterations: Number of gradient steps per guided step.
         step: Length of a gradient step: the clean estimate of a latent cell moves by `step` times the gradient, whose
             length is clipped to 1 (latent units per metre).
@@ -119,7 +119,7 @@ class ConstraintGuidance:
         diffusion: Noise schedule.
 
     Raises:
-        ValueError: A requested constraint is unknown, or the model lacks its categories.
+        ValueError: A requested constraint is unknown, or the model lacks its categories or ground classes.
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class ConstraintGuidance:
             return self._measure_each(latents, start)[0]
 
     def _decode(self, latent: Tensor) -> _Start:
-        """Return what stays the same during the gradient steps of a guided step."""
+        """Return the values that are constant during the gradient steps of a guided step."""
         shift, scale = self.moments()
         output = self.lvae.decode(latent * scale + shift)
         chosen = find_objects(

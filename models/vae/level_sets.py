@@ -1,8 +1,9 @@
 """Ground decoder whose classes are level sets: smooth borders at any resolution.
 
-The convolutional decoder returns a signed distance from the border of each class and a height at nodes. Cubic B-splines
-between the nodes make both smooth (twice continuously differentiable). A class covers the points with a positive signed
-distance. Its occupancy logit is the signed distance times a learned slope. The paper has one logit per pixel instead.
+The convolutional decoder returns spline coefficients of the signed distance from the border of each class and of the
+height at nodes. Uniform cubic B-splines evaluate both, which are therefore twice continuously differentiable. A class
+covers the points with a positive signed distance. Its occupancy logit is the signed distance times a learned slope. The
+paper has one logit per pixel instead.
 """
 
 from __future__ import annotations

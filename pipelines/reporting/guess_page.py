@@ -1,7 +1,7 @@
 """Render a page with real and generated scenes in random order, on which a reader guesses which scenes are generated.
 
-The page does not show which is which before the reader has guessed. Then it counts the right answers, next to the
-number that guessing without looking gives.
+The page reveals the source of a scene after the guess. It shows the number of right guesses next to the number that
+random guesses give.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def render_guess_html(
             '<button type="button" data-guess="1">generated</button> <span></span></figcaption></figure>'
         )
         on_scene()
-    hidden = base64.b64encode(answers.encode()).decode()  # The answers are not readable in the source by accident.
+    hidden = base64.b64encode(answers.encode()).decode()  # Encoded, so that nobody reads the answers by accident.
     words = f"{len(real)} real and {len(generated)} generated scenes in random order. Which ones are generated?"
     return _PAGE.format(
         style=STYLE, title=escape(title), words=words, figures="".join(figures), answers=json.dumps(hidden)

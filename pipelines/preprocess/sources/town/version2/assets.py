@@ -176,7 +176,7 @@ def _add_line(site: Site, frame: LocalFrame, ends: Rect, what: str, piece: float
 
 
 def add_steps(site: Site, frame: LocalFrame, s: float, t0: float, t1: float, walk_m: float) -> None:
-    """Add low walls at a door or a drive of width walk_m: along its sides, along the sidewalk, and a step."""
+    """Add low walls at a door or a driveway of width walk_m: along its sides, along the sidewalk, and a step."""
     rng = site.rng
     length = float(np.clip(rng.uniform(2.0, 6.5), 0.9, max(0.9, t1 - t0)))
     t = t1 - length / 2 if rng.random() < 0.4 else t0 + length / 2

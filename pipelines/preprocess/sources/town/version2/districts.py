@@ -26,8 +26,8 @@ class District:
     greens: float  # Share of rows without houses.
     vacant: float  # Share of plots without a house.
     garages: float
-    drives: float  # Share of plots with a driveway.
-    drive_cars: float
+    driveways: float  # Share of plots with a driveway.
+    driveway_cars: float
     paved_fronts: float  # Share of front yards that are paved.
     lawn: float  # Share of rows with annotated ground between the buildings.
     ground_below: float  # Share of rows whose annotated ground continues below the houses.
@@ -38,7 +38,7 @@ class District:
     kerb_cars: float  # Share of occupied places in a row of cars along the kerb.
     hedges: float  # Share of plot borders that are hedges.
     walls: float  # Share of plot borders that are walls.
-    steps_per_plot: float  # Number of low walls at drives and doors.
+    steps_per_plot: float  # Number of low walls at driveways and doors.
     shrubs_per_100m: float
     bushes_per_100m: float
     trees_per_100m: float
@@ -68,8 +68,8 @@ DISTRICTS = {
         greens=0.02,
         vacant=0.04,
         garages=0.7,
-        drives=0.6,
-        drive_cars=0.8,
+        driveways=0.6,
+        driveway_cars=0.8,
         paved_fronts=0.55,
         lawn=0.71,
         ground_below=0.5,
@@ -108,8 +108,8 @@ DISTRICTS = {
         greens=0.04,
         vacant=0.04,
         garages=0.8,
-        drives=0.9,
-        drive_cars=0.8,
+        driveways=0.9,
+        driveway_cars=0.8,
         paved_fronts=0.3,
         lawn=1.0,
         ground_below=0.95,
@@ -148,8 +148,8 @@ DISTRICTS = {
         greens=0.15,
         vacant=0.15,
         garages=0.6,
-        drives=0.65,
-        drive_cars=0.66,
+        driveways=0.65,
+        driveway_cars=0.66,
         paved_fronts=0.12,
         lawn=1.0,
         ground_below=0.9,

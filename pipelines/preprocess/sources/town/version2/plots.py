@@ -1,4 +1,4 @@
-"""Build the plots of a row: houses, garages, drives, paths, annotated ground, gardens and small objects.
+"""Build the plots of a row: houses, garages, driveways, paths, annotated ground, gardens and small objects.
 
 A row runs along a street. Its houses stand on one building line. The annotated ground ends at a depth behind the
 houses, because a vehicle on the street sees no further.
@@ -66,11 +66,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot of a row: width, extent of the house along the street, and widths of the drive and of the left gap."""
+    """A plot of a row: width, extent of the house along the street, and widths of the driveway and of the left gap."""
 
     width: float
     front: float
-    drive: float
+    driveway: float
     left: float
     joined: bool = False
 
@@ -108,7 +108,7 @@ def build_row(site: Site, frame: LocalFrame, length: float, row: Row) -> None:
     used = sum(plot.width for plot in plots)
     factor, s = length / used, 0.0
     for plot in plots:
-        scaled = Plot(plot.width * factor, plot.front * factor, plot.drive * factor, plot.left * factor, plot.joined)
+        scaled = Plot(plot.width * factor, plot.front * factor, plot.driveway * factor, plot.left * factor, plot.joined)
         _build_plot(site, frame.at(s, 0.0), row, scaled)
         s += scaled.width
 
@@ -122,8 +122,10 @@ def _plan_plots(site: Site, row: Row, length: float) -> list[Plot]:
         if row.kind in ("detached", "court"):
             front = float(size[rng.integers(0, 2)])
             gaps = rng.uniform(*district.gap_m, 2)
-            drive = float(rng.uniform(5.0, 8.4)) if row.kind == "detached" and rng.random() < district.drives else 0.0
-            plot = Plot(front + drive + float(gaps.sum()), front, drive, float(gaps[0]))
+            driveway = (
+                float(rng.uniform(5.0, 8.4)) if row.kind == "detached" and rng.random() < district.driveways else 0.0
+            )
+            plot = Plot(front + driveway + float(gaps.sum()), front, driveway, float(gaps[0]))
         else:
             front = float(rng.uniform(5.6, 7.6) if row.kind == "terrace" else rng.uniform(9.0, 17.0))
             gap = 0.0
@@ -144,8 +146,8 @@ def _build_plot(site: Site, frame: LocalFrame, row: Row, plot: Plot) -> None:
         build_green(site, frame, plot.width, min(row.depth, row.seen))
         return
     mirrored = not plot.joined and rng.random() < 0.5
-    # A mirrored plot has its drive on the other side: s is reflected.
-    s0 = plot.left + (plot.drive if not mirrored else 0.0)
+    # A mirrored plot has its driveway on the other side: s is reflected.
+    s0 = plot.left + (plot.driveway if not mirrored else 0.0)
     setback = row.setback + (0.0 if plot.joined else float(rng.normal(0, 0.35)))
     setback = float(np.clip(setback, 0.1, max(0.2, row.depth - row.house_depth)))
     across = row.house_depth * (1.0 if plot.joined else float(np.exp(rng.normal(0, 0.12))))
@@ -156,17 +158,17 @@ def _build_plot(site: Site, frame: LocalFrame, row: Row, plot: Plot) -> None:
     taken: list[Rect] = [walls]
     open_front: list[tuple[float, float]] = []
     if not plot.joined and rng.random() < district.passages:
-        room = plot.width - plot.front - plot.drive - plot.left if mirrored is False else plot.left
+        room = plot.width - plot.front - plot.driveway - plot.left if mirrored is False else plot.left
         wide = min(room, float(rng.uniform(1.8, 4.2)))
         side = (walls[1], walls[1] + wide) if not mirrored else (walls[0] - wide, walls[0])
         painted.append((GROUND, (*side, 0.0, setback + across)))
         taken.append((*side, 0.0, setback + across))
-    if plot.drive > 2.2:
-        strip = (plot.left, plot.left + plot.drive) if not mirrored else (walls[1], walls[1] + plot.drive)
-        drive = _build_drive(site, frame, row, walls, strip)
-        painted.append((PARKING if rng.random() < 0.85 else GROUND, drive))
-        taken.append(drive)
-        open_front.append(drive[:2])
+    if plot.driveway > 2.2:
+        strip = (plot.left, plot.left + plot.driveway) if not mirrored else (walls[1], walls[1] + plot.driveway)
+        driveway = _build_driveway(site, frame, row, walls, strip)
+        painted.append((PARKING if rng.random() < 0.85 else GROUND, driveway))
+        taken.append(driveway)
+        open_front.append(driveway[:2])
     court = row.kind == "court" or (rng.random() < district.paved_fronts and setback > 2.0)
     if row.kind == "court":
         lot = (0.0, plot.width, 0.0, setback - 0.6)
@@ -214,8 +216,8 @@ def _add_building(site: Site, frame: LocalFrame, label: str, walls: Rect, height
     site.sheet.boxes(frame, label, (walls[0] + walls[1]) / 2, (walls[2] + walls[3]) / 2, size, yaw)
 
 
-def _build_drive(site: Site, frame: LocalFrame, row: Row, walls: Rect, strip: tuple[float, float]) -> Rect:
-    """Build a drive next to a house, with a garage at its end, a car and low walls. Return the drive."""
+def _build_driveway(site: Site, frame: LocalFrame, row: Row, walls: Rect, strip: tuple[float, float]) -> Rect:
+    """Build a driveway next to a house, with a garage at its end, a car and low walls. Return the driveway."""
     rng, width = site.rng, strip[1] - strip[0]
     end = float(np.clip(walls[2] + rng.uniform(1.0, 9.0), 4.8, max(4.8, row.depth - 6.0)))
     if rng.random() < site.district.garages and row.depth - end > 5.0:
@@ -224,7 +226,7 @@ def _build_drive(site: Site, frame: LocalFrame, row: Row, walls: Rect, strip: tu
         apart = float(rng.uniform(0.3, 0.7)) if rng.random() < DETACHED_GARAGES else 0.05
         garage = (strip[0] + apart, strip[1] - apart, end, end + deep)
         _add_building(site, frame, "garage", garage, float(size[2]), 0.0)
-    if rng.random() < site.district.drive_cars * site.variation.cars and end > 5.0:
+    if rng.random() < site.district.driveway_cars * site.variation.cars and end > 5.0:
         middle = (strip[0] + strip[1]) / 2
         add_cars(site, frame, np.array([middle]), float(rng.uniform(2.6, max(2.7, end - 2.4))), np.pi / 2, 0.4)
     if rng.random() < 0.45 * min(1.5, site.variation.walls):

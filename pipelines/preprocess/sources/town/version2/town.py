@@ -47,9 +47,10 @@ CORNER_M = (3.5, 7.5)  # Radius of kerbs.
 SKEWED = 0.7  # Share of towns whose streets do not cross at right angles.
 MAX_SKEW = 0.3  # Largest tangent of the deviation from a right angle.
 SKEW_WAVE_M = 4000.0
-SUNK_M = 0.1  # Least depth of a building below the lowest point of the surface under its walls.
-# Depth of objects below the surface (m): mean, standard deviation, and limits, as in the first half of the KITTI-360
-# excerpt. Its annotations hold no people and two-wheelers.
+SUNK_M = 0.1  # Least depth of a building below the lowest surface under its corners.
+# Depth of static objects below the surface (m): mean, standard deviation, and limits. Source: first half of the
+# KITTI-360 excerpt. Its cars vary by 2 cm, apart from one that floats. It has no people, two-wheelers and trucks; their
+# values are assumed.
 DEPTH_M = {
     "vegetation_cuboid": (0.2, 0.3, (-0.2, 1.2)),
     "construction_big": (0.25, 0.35, (0.0, 1.5)),
@@ -173,7 +174,7 @@ def _settle_boxes(boxes: dict[str, np.ndarray], ground: SlabGround, land: Land) 
     center[built, :2], size[built, :2], kept = separate_buildings(
         center[built, :2], axis, size[built, :2], _list_street_triangles(ground)
     )
-    # A building stands on the lowest point of the surface under its corners.
+    # The bottom lies SUNK_M below the lowest surface under the corners.
     corners = compute_corners(center[built, :2], axis, size[built, :2])
     center[built, 2] = land.surface_m(corners).min(axis=1) - SUNK_M + size[built, 2] / 2
     keep = np.ones(len(center), bool)
@@ -186,7 +187,7 @@ def _settle_boxes(boxes: dict[str, np.ndarray], ground: SlabGround, land: Land) 
 
 
 def _remove_overlapping(boxes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Remove static objects that overlap an earlier object of their category."""
+    """Remove static objects of APART whose IoU3D with an earlier kept object of their category exceeds MAX_IOU3D."""
     index = np.flatnonzero(np.isin(boxes["category"], APART) & (boxes["timestamp"] == STATIC))
     shapes = make_boxes(*(boxes[name][index] for name in ("center_m", "rotation", "size_m")))
     i, j = find_overlapping_bounds(shapes, shapes)
@@ -200,7 +201,7 @@ def _remove_overlapping(boxes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _sink_boxes(boxes: dict[str, np.ndarray], rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Lower the objects by random depths (DEPTH_M)."""
+    """Lower static objects by random depths (DEPTH_M)."""
     center_m = boxes["center_m"].copy()
     for name, (mean, spread, limits) in DEPTH_M.items():
         chosen = (boxes["category"] == CATEGORY_INDEX[name]) & (boxes["timestamp"] == STATIC)
