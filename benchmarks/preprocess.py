@@ -234,7 +234,7 @@ def main(config: Config) -> None:
             "ground_classes": list(drive.ground_classes),
         }
         manifest["extremes"] = shard_writer.compute_extremes([drive.scene(int(k), "train", grid) for k in poses[:50]])
-        spec = compute_training_statistics([manifest], f"{out}/0", grid, None).spec
+        spec = compute_training_statistics([manifest], f"{out}/0", grid, 95.0).spec
         for pixels in (256, 128):
             reader, rates = LayoutReader(spec.with_resolution(pixels)), []
             for _ in range(3):

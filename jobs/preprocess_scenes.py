@@ -41,9 +41,9 @@ class Town:
     free_pose_share: float | None = None
     """Share of the scenes that are crops at any place and heading, instead of views of a vehicle (default: 0.25 for
     version 2, 0 for version 1)."""
-    slots: Literal["p95", "paper"] = "p95"
-    """Rule for the number of slots per category: the 95th percentile over the training split, or the paper's 514 slots
-    in total."""
+    slots: Literal["p95", "p99.5", "paper"] = "p95"
+    """Rule for the number of slots per category: a percentile over the training split, or the paper's 514 slots in
+    total. Models do not learn objects beyond these slots."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,9 @@ class Kitti360:
     log_format: LogFormatOption = "text"
     make_split: bool = True
     """Split each drive into training and test segments as in the paper; --no-make-split trains on every pose."""
-    slots: Literal["p95", "paper"] = "p95"
-    """Rule for the number of slots per category: the 95th percentile over the training split, or the paper's 514 slots
-    in total."""
+    slots: Literal["p95", "p99.5", "paper"] = "p95"
+    """Rule for the number of slots per category: a percentile over the training split, or the paper's 514 slots in
+    total. Models do not learn objects beyond these slots."""
     skip_unreadable: bool = False
     """Skip sequences with unreadable XML and list them in rejects; without this option, the job stops."""
 
@@ -91,9 +91,9 @@ class Own:
     log_format: LogFormatOption = "text"
     make_split: bool = True
     """Split each drive into training and test segments as in the paper; --no-make-split trains on every pose."""
-    slots: Literal["p95", "paper"] = "p95"
-    """Rule for the number of slots per category: the 95th percentile over the training split, or the paper's 514 slots
-    in total."""
+    slots: Literal["p95", "p99.5", "paper"] = "p95"
+    """Rule for the number of slots per category: a percentile over the training split, or the paper's 514 slots in
+    total. Models do not learn objects beyond these slots."""
     skip_unreadable: bool = False
     """Skip unreadable drives and list them in rejects; without this option, the job stops."""
 

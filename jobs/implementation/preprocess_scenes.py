@@ -16,6 +16,7 @@ from pipelines.preprocess import sharding
 from pipelines.preprocess.ingest import ingest_drives
 
 NOT_RECORDED = ("output", "skip_unreadable", "if_busy", "log_format")
+SLOTS = {"p95": 95.0, "p99.5": 99.5, "paper": PAPER_SLOTS}  # Percentile, or number of slots per category.
 FREE_POSE_SHARE = 0.25  # Default for version 2 of the town.
 RECORDED_AS = {"make_split": "split"}  # keys in dataset.json
 
@@ -55,7 +56,7 @@ def main(config: Town | Kitti360 | Av2 | Own) -> None:
     source = options["source"]
     output = resolve_path(config.output, "datasets", source)
     skip = getattr(config, "skip_unreadable", False)
-    slots = PAPER_SLOTS if options.get("slots") == "paper" else None
+    slots = SLOTS[options.get("slots", "p95")]
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

@@ -208,6 +208,8 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
 def load_start(model: str, architecture: dict, spec: LayoutSpec) -> LayoutVAE:
     """Return the trained layout VAE from which a run starts.
 
+    The networks of the decoder "cells" do not depend on the number of slots, which may therefore differ.
+
     Args:
         model: Directory of a layout VAE, or any value that --model accepts.
         architecture: Options of the preset.
@@ -224,8 +226,21 @@ def load_start(model: str, architecture: dict, spec: LayoutSpec) -> LayoutVAE:
                 f"--start-from {model}: its {key} is {built}, but that of this preset is {wanted}; use the preset with"
                 " which it was trained"
             )
-    lvae.spec.require(spec, f"the dataset of this run, which continues {model},")
-    return lvae
+    own = lvae.spec
+    if lvae.config.objects["decoder"] == "cells":
+        own = replace(own, slots=spec.slots) if len(own.slots) == len(spec.slots) else own
+    own.require(spec, f"the dataset of this run, which continues {model},")
+    if own == lvae.spec:
+        return lvae
+    resized = LayoutVAE.from_config({**lvae.config, "layout": spec.to_dict()})
+    try:
+        resized.load_state_dict(lvae.state_dict())
+    except RuntimeError as error:
+        raise ValueError(
+            f"--start-from {model}: with the slots of this dataset {spec.slots}, the decoder has another size than with"
+            f" {lvae.spec.slots}; preprocess the dataset with the same --slots"
+        ) from error
+    return resized.requires_grad_(False)
 
 
 def list_kept_options(options: Mapping[str, Any]) -> list[tuple[str, Any]]:

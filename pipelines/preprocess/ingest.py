@@ -153,7 +153,7 @@ def ingest_drives(
     tasks: list[ShardTask],
     root: str,
     options: dict,
-    slots: tuple[int, ...] | None = None,
+    slots: tuple[int, ...] | float = 95.0,
     grid: Grid | None = None,
     skip_unreadable: bool = False,
     on_shard: Callable[[dict], None] | None = None,
@@ -166,7 +166,7 @@ def ingest_drives(
         tasks: Shards to write.
         root: Dataset directory.
         options: User options, which are recorded in dataset.json.
-        slots: Number of slots per category (default: 95th percentile of the category's count in the training scenes).
+        slots: Number of slots per category, or percentile of the category's count in the training scenes.
         grid: Raster grid of the scenes (default: the paper's).
         skip_unreadable: Whether unreadable drives become rejects. If False, an unreadable drive raises an error after
             all other drives are in the staging directory.

@@ -53,7 +53,7 @@ def count_groups(scenes: pa.Table, group: tuple[int, ...]) -> np.ndarray:
 
 
 def compute_training_statistics(
-    manifests: list[dict], staging: str, grid: Grid, slots: tuple[int, ...] | None
+    manifests: list[dict], staging: str, grid: Grid, slots: tuple[int, ...] | float
 ) -> Statistics:
     """Compute density thresholds, slots per category and value bounds from the training split.
 
@@ -61,7 +61,7 @@ def compute_training_statistics(
         manifests: Manifests of all shards.
         staging: Directory with the tables of the shards.
         grid: Grid of the rasters.
-        slots: Number of slots per category; in the paper, they sum to N = 514. None: the 95th percentile of each
+        slots: Number of slots per category; in the paper, they sum to N = 514. A float is a percentile of each
             category's count per scene.
 
     Returns:
@@ -78,8 +78,10 @@ def compute_training_statistics(
     scenes = pa.concat_tables([shard.read("scenes", columns) for shard in shards])
     counts = np.stack([scenes[f"num_{name}"].to_numpy() for name in CATEGORIES], axis=1)
     present = counts.sum(axis=0) > 0
-    p95 = np.ceil(np.percentile(counts, 95, axis=0)).clip(1).astype(int)
-    chosen = np.array(slots) if slots else p95
+    if isinstance(slots, tuple):
+        chosen = np.array(slots)
+    else:
+        chosen = np.ceil(np.percentile(counts, slots, axis=0)).clip(1).astype(int)
 
     measured = merge_extremes(m["extremes"] for m in training)
 
