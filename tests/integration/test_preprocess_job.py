@@ -8,6 +8,7 @@ import duckdb
 import numpy as np
 import pytest
 
+from jobs.implementation.preprocess_scenes import SLOTS
 from models.scene import CATEGORIES, Grid
 from pipelines.preprocess import ingest
 from pipelines.preprocess.shard_writer import ShardCut, write_shard
@@ -63,6 +64,15 @@ def test_preprocess_aligns_shards_and_labels_by_training_split(town):
     expected = {c: max(1, int(np.ceil(n))) for c, n in zip(CATEGORIES, p95, strict=True)}
     assert all(expected[c] == n for c, n in zip(dataset.spec.categories, dataset.spec.slots, strict=True))
     assert not (town / ".staging").exists()
+
+
+def test_slots_follow_the_chosen_percentile(cluster, tmp_path):
+    ingest.ingest_drives(plan_town(8, 8, 5), str(tmp_path), {"source": "town"}, SLOTS["p99.5"])
+    columns = ", ".join(f"num_{category}" for category in CATEGORIES)
+    counts = query_table(tmp_path, f"select {columns} from TABLE where split = 'train'")
+    expected = np.ceil(np.percentile(np.array(counts, float), 99.5, axis=0)).astype(int)
+    spec = Dataset.open(str(tmp_path)).spec
+    assert spec.slots == tuple(int(n) for n in expected if n) and len(counts) == 8
 
 
 def test_preprocess_tables_equal_drive(town):
