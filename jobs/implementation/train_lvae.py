@@ -154,6 +154,8 @@ def make_run_identity(
         identity |= {"init_from_data": False}
     if (least := row.model.objects.min_proposals_per_cell) != 1:  # earlier versions did not record this option
         identity |= {"least_per_cell": least}
+    if row.model.objects.order_in_cell:
+        identity |= {"order_in_cell": True}
     return identity
 
 
@@ -226,9 +228,8 @@ def load_start(model: str, architecture: dict, spec: LayoutSpec) -> LayoutVAE:
                 f"--start-from {model}: its {key} is {built}, but that of this preset is {wanted}; use the preset with"
                 " which it was trained"
             )
-    own = lvae.spec
-    if lvae.config.objects["decoder"] == "cells":
-        own = replace(own, slots=spec.slots) if len(own.slots) == len(spec.slots) else own
+    may_resize = lvae.config.objects["decoder"] == "cells" and len(lvae.spec.slots) == len(spec.slots)
+    own = replace(lvae.spec, slots=spec.slots) if may_resize else lvae.spec
     own.require(spec, f"the dataset of this run, which continues {model},")
     if own == lvae.spec:
         return lvae

@@ -24,7 +24,7 @@ def find_suppressed(boxes: Boxes, category: np.ndarray, existence: np.ndarray) -
     Args:
         boxes: n boxes.
         category: (n,) categories.
-        existence: (n,) existence probabilities.
+        existence: (n,) existence probabilities, or other values that order the boxes.
 
     Returns:
         (n,) bool; True for each box to remove.

@@ -122,9 +122,8 @@ def _plan_plots(site: Site, row: Row, length: float) -> list[Plot]:
         if row.kind in ("detached", "court"):
             front = float(size[rng.integers(0, 2)])
             gaps = rng.uniform(*district.gap_m, 2)
-            driveway = (
-                float(rng.uniform(5.0, 8.4)) if row.kind == "detached" and rng.random() < district.driveways else 0.0
-            )
+            has_driveway = row.kind == "detached" and rng.random() < district.driveways
+            driveway = float(rng.uniform(5.0, 8.4)) if has_driveway else 0.0
             plot = Plot(front + driveway + float(gaps.sum()), front, driveway, float(gaps[0]))
         else:
             front = float(rng.uniform(5.6, 7.6) if row.kind == "terrace" else rng.uniform(9.0, 17.0))

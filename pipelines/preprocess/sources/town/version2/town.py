@@ -10,7 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.geometry.iou3d import compute_iou3d_pairs, find_overlapping_bounds, make_boxes
+from models.geometry.iou3d import make_boxes
+from models.geometry.suppression import find_suppressed
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES
 from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
 from pipelines.preprocess.sources.town.districts import TOWN_KINDS
@@ -62,7 +63,7 @@ DEPTH_M = {
     "vehicle_small": (0.0, 0.02, (-0.03, 0.03)),
     "vehicle_big": (0.0, 0.02, (-0.03, 0.03)),
 }
-MAX_IOU3D = 0.15  # Of two walls, people, two-wheelers or objects with a higher IoU3D, the second one is removed.
+# Categories whose objects do not overlap, as in KITTI-360.
 APART = [CATEGORY_INDEX[name] for name in ("construction_small", "human", "two_wheelers", "object")]
 FREE_CROP_M = 64.0  # Side of the crop ahead of a free pose.
 FREE_MARGIN_M = 14.0  # Largest distance of the corners of a free crop from the outermost streets.
@@ -187,16 +188,11 @@ def _settle_boxes(boxes: dict[str, np.ndarray], ground: SlabGround, land: Land) 
 
 
 def _remove_overlapping(boxes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Remove static objects of APART whose IoU3D with an earlier kept object of their category exceeds MAX_IOU3D."""
+    """Remove static objects of APART that a decoder would suppress as duplicates of earlier objects."""
     index = np.flatnonzero(np.isin(boxes["category"], APART) & (boxes["timestamp"] == STATIC))
     shapes = make_boxes(*(boxes[name][index] for name in ("center_m", "rotation", "size_m")))
-    i, j = find_overlapping_bounds(shapes, shapes)
-    both = (i < j) & (boxes["category"][index[i]] == boxes["category"][index[j]])
-    i, j = i[both], j[both]
-    hit = compute_iou3d_pairs(shapes.take(i), shapes.take(j)) > MAX_IOU3D
     keep = np.ones(len(boxes["category"]), bool)
-    for first, second in zip(index[i[hit]].tolist(), index[j[hit]].tolist(), strict=True):
-        keep[second] &= not keep[first]
+    keep[index[find_suppressed(shapes, boxes["category"][index], -np.arange(len(index)))]] = False
     return {name: values[keep] for name, values in boxes.items()}
 
 
