@@ -87,6 +87,7 @@ def test_unshared_node_that_joins_later_stops_the_job(folder, tmp_path):
         assert not list(output.rglob(".node-*"))
 
 
+@pytest.mark.slow
 def test_chain_on_s3_survives_loss_of_a_node(s3, folder, cluster, tmp_path, monkeypatch):
     from jobs.implementation.sample_scenes import sample
     from jobs.sample_scenes import Config
