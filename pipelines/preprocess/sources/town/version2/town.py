@@ -65,6 +65,7 @@ DEPTH_M = {
 }
 # Categories whose objects do not overlap, as in KITTI-360.
 APART = [CATEGORY_INDEX[name] for name in ("construction_small", "human", "two_wheelers", "object")]
+APART_IOU3D = np.full(len(CATEGORY_INDEX), 0.15)  # Largest IoU3D of two objects of the same category.
 FREE_CROP_M = 64.0  # Side of the crop ahead of a free pose.
 FREE_MARGIN_M = 14.0  # Largest distance of the corners of a free crop from the outermost streets.
 MAX_TRIES = 10_000
@@ -188,11 +189,11 @@ def _settle_boxes(boxes: dict[str, np.ndarray], ground: SlabGround, land: Land) 
 
 
 def _remove_overlapping(boxes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Remove static objects of APART that a decoder would suppress as duplicates of earlier objects."""
+    """Remove static objects of APART that overlap earlier objects of their category."""
     index = np.flatnonzero(np.isin(boxes["category"], APART) & (boxes["timestamp"] == STATIC))
     shapes = make_boxes(*(boxes[name][index] for name in ("center_m", "rotation", "size_m")))
     keep = np.ones(len(boxes["category"]), bool)
-    keep[index[find_suppressed(shapes, boxes["category"][index], -np.arange(len(index)))]] = False
+    keep[index[find_suppressed(shapes, boxes["category"][index], -np.arange(len(index)), APART_IOU3D)]] = False
     return {name: values[keep] for name, values in boxes.items()}
 
 
