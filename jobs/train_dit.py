@@ -65,6 +65,9 @@ class Config:
     """Target that the network predicts (default: as in the preset; paper: epsilon)."""
     normalise_latents: bool | None = None
     """Normalise each latent channel to mean 0 and standard deviation 1 (default: as in the preset; paper: False)."""
+    sample_posterior: bool | None = None
+    """Draw training latents from the posteriors of the layout VAE; if False, use the means (default: as in the preset;
+    paper: True)."""
     timestep_sampling: Literal["uniform", "logit-normal"] = "uniform"
     """Distribution of training timesteps: uniform (the paper), or logit-normal, which prefers middle timesteps."""
     loss_weighting: Literal["uniform", "min-snr"] = "uniform"

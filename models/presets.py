@@ -141,6 +141,8 @@ class DiTPreset:
             the paper (jobs/outpaint_scenes.py).
         attach: Whether decoding attaches signs and poles (models/composition/attachments.py). The paper does not do
             this.
+        sample_posterior: Whether training latents are drawn from the posteriors of the layout VAE, as in the paper. If
+            False, they are the means.
     """
 
     lvae: str
@@ -155,6 +157,7 @@ class DiTPreset:
     label_dropout: float = 0.1
     neighbour_latents: str = "reencode"
     attach: bool = True
+    sample_posterior: bool = True
 
     def architecture(self) -> dict:
         """Return all keyword arguments of `DiT` except those that depend on the latents."""

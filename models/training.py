@@ -343,27 +343,37 @@ def compute_loss_weight(dit: DiT, timestep: Int[Tensor, " b"], weighting: LossWe
     return (signal / noise).clamp(max=MIN_SNR_GAMMA) * noise / signal
 
 
-def make_diffusion_loss(
-    dit: DiT,
-    label_dropout: float,
-    timestep_sampling: TimestepSampling = "uniform",
-    loss_weighting: LossWeighting = "uniform",
-) -> LossFunction:
+@dataclass(frozen=True)
+class DiffusionLossConfig:
+    """Options of the loss of stage 2; the defaults are those of the paper.
+
+    Attributes:
+        timestep_sampling: Density of the timesteps (`sample_timesteps`).
+        loss_weighting: Weighting of the timesteps (`compute_loss_weight`).
+        sample_posterior: Whether each step draws latents from the posteriors of the layout VAE. If False, the latents
+            are the means of the posteriors.
+    """
+
+    timestep_sampling: TimestepSampling = "uniform"
+    loss_weighting: LossWeighting = "uniform"
+    sample_posterior: bool = True
+
+
+def make_diffusion_loss(dit: DiT, label_dropout: float, config: DiffusionLossConfig | None = None) -> LossFunction:
     """Return the loss function of stage 2 (training of the DiT): mean squared error of the noise (Eq. "LDM").
 
-    With v-prediction, the error is weighted (`compute_loss_weight`). Each step samples new latents from the cached
-    posteriors. Labels are dropped once per sample. Before, a partial label loses each density with the probability
-    PART_DROPOUT.
+    With v-prediction, the error is weighted (`compute_loss_weight`). Labels are dropped once per sample. Before, a
+    partial label loses each density with the probability PART_DROPOUT.
 
     Args:
         dit: Model on its device, which defines the noise schedule.
         label_dropout: Probability that a training sample gets the null label.
-        timestep_sampling: Density of the timesteps (`sample_timesteps`).
-        loss_weighting: Weighting of the timesteps (`compute_loss_weight`).
+        config: Options; None: those of the paper.
 
     Returns:
         A function that computes the losses from a batch of posteriors (`mean`, `logvar`) and labels (`label`).
     """
+    config = config or DiffusionLossConfig()
     diffusion = dit.diffusion
     shape = (dit.config.channels, dit.config.size, dit.config.size)
     shift = torch.tensor(dit.config.shift or [0.0] * shape[0], device=dit.device)[:, None, None]
@@ -377,17 +387,18 @@ def make_diffusion_loss(
         mean, logvar, label = arrays["mean"].float(), arrays["logvar"].float(), arrays["label"]
         device = mean.device
         # No line below waits for a GPU. Random numbers are thus drawn during the backward pass of the previous step.
-        posterior_noise, noise = sample_noise(generators, shape, device, count=2)
+        *posterior_noise, noise = sample_noise(generators, shape, device, count=1 + config.sample_posterior)
         uniform = sample_uniform(generators, 2 if remaining is None else 4, device)
-        latent = (mean + (0.5 * logvar).exp() * posterior_noise - shift) / scale
-        timestep = sample_timesteps(uniform[:, 0], timestep_sampling, diffusion.num_timesteps)
+        drawn = mean + (0.5 * logvar).exp() * posterior_noise[0] if posterior_noise else mean
+        latent = (drawn - shift) / scale
+        timestep = sample_timesteps(uniform[:, 0], config.timestep_sampling, diffusion.num_timesteps)
         if remaining is not None:
             dropped = (uniform[:, 2:] < PART_DROPOUT).long()
             label = remaining[label, dropped[:, 0] + 2 * dropped[:, 1]]
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
         predicted = model(diffusion.add_noise(latent, noise, timestep), timestep, label)
         error = F.mse_loss(predicted.float(), noise, reduction="none").flatten(1).mean(1)
-        weight = compute_loss_weight(dit, timestep, loss_weighting)
+        weight = compute_loss_weight(dit, timestep, config.loss_weighting)
         return {"loss": (weight * error).mean(), "noise_error": error.mean()}
 
     return loss
@@ -639,8 +650,7 @@ def make_dit_trainer(
     device: torch.device,
     wrap: Wrap = lambda m: m,
     execution: ExecutionConfig | None = None,
-    timestep_sampling: TimestepSampling = "uniform",
-    loss_weighting: LossWeighting = "uniform",
+    loss_config: DiffusionLossConfig | None = None,
 ) -> Trainer:
     """Return a trainer of a diffusion transformer.
 
@@ -651,15 +661,14 @@ def make_dit_trainer(
         device: Device of the training.
         wrap: Function that wraps the model, for example with DistributedDataParallel; None: no wrapper.
         execution: Options of the execution; None: the defaults of `ExecutionConfig`.
-        timestep_sampling: Density of the timesteps (`sample_timesteps`).
-        loss_weighting: Weighting of the timesteps (`compute_loss_weight`).
+        loss_config: Options of the loss; None: those of the paper.
 
     Returns:
         The trainer.
     """
     execution = execution or ExecutionConfig()
     model = model.to(device)
-    loss = make_diffusion_loss(model, label_dropout, timestep_sampling, loss_weighting)
+    loss = make_diffusion_loss(model, label_dropout, loss_config)
     if execution.compile:
         for block in model.blocks:  # All blocks share the compiled code.
             block.compile(dynamic=False)

@@ -39,10 +39,9 @@ from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTPreset, find_preset
 from models.training import (
+    DiffusionLossConfig,
     ExecutionConfig,
-    LossWeighting,
     OptimizerConfig,
-    TimestepSampling,
     Trainer,
     Wrap,
     make_dit_settings,
@@ -81,16 +80,14 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     record = trainer.guard_run_name(name, home_path("runs"), identity)
     tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
     execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
-    timestep_sampling, loss_weighting = parse_timestep_sampling(config), parse_loss_weighting(config)
+    loss_config = make_loss_config(config, row)
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
     check_training_labels(shards, label_kind)
     training = TrainingRun(
         name=name,
         storage_path=home_path("runs"),
-        build=partial(
-            build, architecture, settings, execution, row.label_dropout, start, timestep_sampling, loss_weighting
-        ),
+        build=partial(build, architecture, settings, execution, row.label_dropout, start, loss_config),
         stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
         reader=LatentReader(latents_root, label_kind),
         settings=settings,
@@ -123,14 +120,13 @@ def check_training_labels(shards: list[Shard], kind: str) -> None:
         print(f"note: no training scene has the label {', '.join(missing)}; do not sample with it")
 
 
-def parse_timestep_sampling(config: Config) -> TimestepSampling:
-    """Return the distribution of training timesteps."""
-    return "logit_normal" if config.timestep_sampling == "logit-normal" else "uniform"
-
-
-def parse_loss_weighting(config: Config) -> LossWeighting:
-    """Return the weighting of the timesteps in the loss."""
-    return "min_snr" if config.loss_weighting == "min-snr" else "uniform"
+def make_loss_config(config: Config, row: DiTPreset) -> DiffusionLossConfig:
+    """Return the options of the loss."""
+    return DiffusionLossConfig(
+        timestep_sampling="logit_normal" if config.timestep_sampling == "logit-normal" else "uniform",
+        loss_weighting="min_snr" if config.loss_weighting == "min-snr" else "uniform",
+        sample_posterior=row.sample_posterior,
+    )
 
 
 def make_smoke_latents(root: str) -> None:
@@ -150,6 +146,8 @@ def resolve_preset(config: Config) -> DiTPreset:
         row = replace(row, model=replace(row.model, prediction=config.prediction_type))
     if config.normalise_latents is not None:
         row = replace(row, normalise_latents=config.normalise_latents)
+    if config.sample_posterior is not None:
+        row = replace(row, sample_posterior=config.sample_posterior)
     return row
 
 
@@ -209,10 +207,13 @@ def make_run_identity(
     )
     if start:
         identity |= {"start_from": start.digest}
-    if (sampling := parse_timestep_sampling(config)) != "uniform":  # earlier versions did not record this option
-        identity |= {"timesteps": RECORDED_TIMESTEPS[sampling]}
-    if (weighting := parse_loss_weighting(config)) != "uniform":
-        identity |= {"loss_weighting": weighting}
+    loss, paper = make_loss_config(config, row), DiffusionLossConfig()  # Earlier versions did not record these options.
+    if loss.timestep_sampling != paper.timestep_sampling:
+        identity |= {"timesteps": RECORDED_TIMESTEPS[loss.timestep_sampling]}
+    if loss.loss_weighting != paper.loss_weighting:
+        identity |= {"loss_weighting": loss.loss_weighting}
+    if loss.sample_posterior != paper.sample_posterior:
+        identity |= {"sample_posterior": loss.sample_posterior}
     return identity
 
 
@@ -272,8 +273,7 @@ def build(
     execution: ExecutionConfig,
     label_dropout: float,
     start: Start | None,
-    timestep_sampling: TimestepSampling,
-    loss_weighting: LossWeighting,
+    loss_config: DiffusionLossConfig,
     device: torch.device,
     wrap: Wrap,
 ) -> Trainer:
@@ -282,7 +282,7 @@ def build(
     model = DiT(**architecture)
     if start:
         model.load_state_dict(start.state)
-    return make_dit_trainer(model, settings, label_dropout, device, wrap, execution, timestep_sampling, loss_weighting)
+    return make_dit_trainer(model, settings, label_dropout, device, wrap, execution, loss_config)
 
 
 def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:

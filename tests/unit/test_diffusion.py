@@ -12,10 +12,12 @@ from models.sampling.diffusion import Diffusion, InpaintCondition, SamplingSched
 from models.sampling.repaint import repaint_transitions
 from models.sampling.schedulers import SchedulerConfig
 from models.training import (
+    DiffusionLossConfig,
     ExecutionConfig,
     NonFiniteLossError,
     OptimizerConfig,
     compute_loss_weight,
+    make_diffusion_loss,
     make_dit_trainer,
 )
 
@@ -223,6 +225,23 @@ def test_dit_overfits_one_batch(prediction):
     losses = [trainer.step(batch, range(2)) for _ in range(300)]
     assert np.mean([float(loss["loss"]) for loss in losses[:5]]) > 0.9
     assert np.mean([float(loss["noise_error"]) for loss in losses[-50:]]) < 0.35
+
+
+def test_diffusion_loss_uses_means_of_posteriors():
+    # With v-prediction, the noise estimate of an untrained network depends on the latents.
+    trainer, batch = make_trainer(prediction="v_prediction"), make_dit_batch()
+    wide = batch | {"logvar": torch.full_like(batch["logvar"], 2.0)}
+    generators = [[torch.Generator().manual_seed(k) for k in range(8)] for _ in range(4)]
+    mean_loss = make_diffusion_loss(trainer.model, 0.0, DiffusionLossConfig(sample_posterior=False))
+    drawn_loss = make_diffusion_loss(trainer.model, 0.0)
+    losses = [
+        float(loss(trainer.model.eval(), arrays, generator)["loss"])
+        for (loss, arrays), generator in zip(
+            [(mean_loss, batch), (mean_loss, wide), (drawn_loss, batch), (drawn_loss, wide)], generators, strict=True
+        )
+    ]
+    assert losses[0] == losses[1]
+    assert losses[2] != losses[3]
 
 
 def test_trainer_resumes_exactly(tmp_path):
