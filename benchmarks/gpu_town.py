@@ -580,6 +580,8 @@ def parse_arguments() -> argparse.Namespace:
     add("--depth", type=int, default=8)
     add("--width", type=int, default=288)
     add("--heads", type=int, default=6)
+    add("--means", action="store_true", help="train the transformer on means of the posteriors")
+    add("--timestep-sampling", choices=("uniform", "logit_normal"), default="uniform")
     add("--no-compile", dest="compile", action="store_false")
     add("--log-every", type=int, default=200)
     add("--cpu", action="store_true", help="rehearsal without a GPU")
@@ -617,8 +619,9 @@ def main() -> None:
 
         model.to(device)
         log("test losses before the training", measure_lvae(model, test, setup.lvae_batch))
-        train_lvae(setup, model, pool, poll())
-        log("test losses", measure_lvae(model, test, setup.lvae_batch))
+        if setup.lvae_seconds:
+            train_lvae(setup, model, pool, poll())
+            log("test losses", measure_lvae(model, test, setup.lvae_batch))
         while pool.size < pool.capacity:
             pool.add(next(made))
     log(f"{pool.size} scenes")
@@ -631,6 +634,9 @@ def main() -> None:
     names = ("mean", "logvar")
     data = dict(zip(names, encode(model, pool, 256), strict=True)) | {"label": pool.labels(thresholds)}
     tested = dict(zip(names, encode(model, test, 256), strict=True)) | {"label": test.labels(thresholds)}
+    if setup.means:  # The comparison of distributions uses the same latents as the training.
+        for part in (data, tested):
+            part["logvar"].fill_(-60)
     shift, scale = compute_channel_statistics(data["mean"])
     (setup.output / "latents.json").write_text(json.dumps({"channel_mean": shift, "channel_std": scale}))
     del pool, test
@@ -650,12 +656,14 @@ def main() -> None:
     log(f"transformer with {sum(p.numel() for p in dit.parameters()) / 1e6:.2f} million parameters")
     run = DiTRun(setup, dit, data, tested)
     start = dict(dit.state_dict())
-    chosen = Variant("uniform", setup.dit_seconds, setup.dit_batch)
+    posterior = not setup.means
+    loss = DiffusionLossConfig(setup.timestep_sampling, sample_posterior=posterior)
+    chosen = Variant("chosen", setup.dit_seconds, setup.dit_batch, loss)
     if setup.compare_seconds:
         losses_of = {
-            "uniform": DiffusionLossConfig(),
-            "min-snr": DiffusionLossConfig(loss_weighting="min_snr"),
-            "logit-normal": DiffusionLossConfig("logit_normal"),
+            "uniform": DiffusionLossConfig(sample_posterior=posterior),
+            "min-snr": DiffusionLossConfig(loss_weighting="min_snr", sample_posterior=posterior),
+            "logit-normal": DiffusionLossConfig("logit_normal", sample_posterior=posterior),
         }
         variants = [Variant(k, setup.compare_seconds, setup.dit_batch, loss) for k, loss in losses_of.items()]
         variants.append(Variant("uniform, small batch", setup.compare_seconds, setup.dit_batch // 4))

@@ -167,14 +167,14 @@ class DiTPreset:
 SMALL_DIT = DiTConfig(2, 6, 256, 4, prediction="v_prediction")
 TOWN_DIT = DiTConfig(2, 8, 288, 6, prediction="v_prediction")
 PAPER_DECODING: dict[str, Any] = {"neighbour_latents": "paper", "attach": False}
-TOWN_TRAINING: dict[str, Any] = {"normalise_latents": True, "learning_rate": 1e-3, "ema_decay": 0.999}
+QUICK_DIT: dict[str, Any] = {"normalise_latents": True, "learning_rate": 1e-3, "ema_decay": 0.999}
 
 # fmt: off
 DIT_PRESETS: dict[str, DiTPreset] = {
     #                         lvae        patch depth width heads batch  steps
     "smoke":       DiTPreset("smoke",    DiTConfig(2, 1, 32, 2),     8,   8, True, 1e-3),
-    "demo":        DiTPreset("demo",     SMALL_DIT,                  16,  30_000, **TOWN_TRAINING),
-    "town":        DiTPreset("town",     TOWN_DIT,                   16,  30_000, **TOWN_TRAINING),
+    "demo":        DiTPreset("demo",     SMALL_DIT,                  16,  30_000, **QUICK_DIT),
+    "town":        DiTPreset("town",     TOWN_DIT,                   16,  30_000, **QUICK_DIT, sample_posterior=False),
     "kitti360-mini": DiTPreset("kitti360-mini", DiTConfig(2, 4, 128, 4), 16, 3_000, learning_rate=1e-3,
                                ema_decay=0.999, **PAPER_DECODING),
     # The paper reports three days of training on four A100s but not the number of steps. It trains all sizes with the

@@ -102,7 +102,7 @@ def test_suppress_duplicates_ignores_suppressed_objects():
     assert find([0.7, 0.9, 0.8]) == [True, False, True]
 
 
-def test_suppress_duplicates_keeps_walls_that_continue_each_other():
+def test_suppress_duplicates_keeps_walls_that_continue():
     # The IoU is 1 / 3, which a decoder's errors can cause where two walls meet.
     assert not find_lower_confidence_duplicates(make_row_of_boxes([0, 2], [0.9, 0.8], "construction_small")).any()
     assert find_lower_confidence_duplicates(make_row_of_boxes([0, 2], [0.9, 0.8], "object")).any()

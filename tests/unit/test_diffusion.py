@@ -235,7 +235,7 @@ def test_diffusion_loss_uses_means_of_posteriors():
     mean_loss = make_diffusion_loss(trainer.model, 0.0, DiffusionLossConfig(sample_posterior=False))
     drawn_loss = make_diffusion_loss(trainer.model, 0.0)
     losses = [
-        float(loss(trainer.model.eval(), arrays, generator)["loss"])
+        float(loss(trainer.model.eval(), arrays, generator)["loss"].detach())
         for (loss, arrays), generator in zip(
             [(mean_loss, batch), (mean_loss, wide), (drawn_loss, batch), (drawn_loss, wide)], generators, strict=True
         )
