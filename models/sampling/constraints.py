@@ -35,7 +35,7 @@ from models.sampling.penalties import (
     sum_penalties,
 )
 
-DEFAULT_WEIGHTS = MappingProxyType({"footprint": 10.0, "heading": 10.0})
+DEFAULT_WEIGHTS = MappingProxyType({"footprint": 10.0, "heading": 10.0, "alignment": 10.0})
 # Penalty (m) of an object whose existence probability changes from 0 to 1: objects must move, not appear or vanish.
 EXISTENCE_M = 5.0
 logger = logging.getLogger(__name__)
@@ -173,7 +173,9 @@ class ConstraintGuidance:
             Displacement; 0 for scenes whose penalty or gradient is not finite.
         """
         radius = self.config.trust * noise_level * clean.shape[1] ** 0.5
-        with torch.inference_mode(False), torch.enable_grad():
+        # Penalties need the precision of float32, also if the caller samples in bfloat16.
+        full_precision = torch.autocast(clean.device.type, enabled=False)
+        with torch.inference_mode(False), torch.enable_grad(), full_precision:
             start = clean.detach().float().clone()
             mask = torch.ones_like(start) if condition is None else condition.mask.clone().to(start)
             if condition is not None:

@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -83,6 +84,11 @@ LANE_SPREAD_M = 4.0  # Standard deviation of the Gaussian weights in this window
 LANE_SAMPLES = 17  # Samples along each side of the window.
 LANE_TOLERANCE_RAD = 0.1  # 90 % of the vehicles of town version 1 deviate by less (0.09; version 2: 0.07).
 LANE_LENGTH_M = 2.0  # Converts sin^2 of the angle to metres: half the length of a car.
+ALIGNED = ("vehicle_big", "vehicle_small", "two_wheelers", "construction_big", "construction_small")
+EDGE_PIXEL_M = 1.0  # Resolution of the nearest edges of the road.
+EDGE_RANGE_M = 30.0  # Objects farther from the road have no penalty on their alignment.
+ALIGNMENT_TOLERANCE_RAD = 0.1
+ALIGNMENT_LENGTH_M = 2.0  # Converts sin^2 of twice the angle to metres.
 MIN_COHERENCE = 0.5  # Below this coherence, for example at junctions, the road has no direction.
 MIN_ELONGATION = 0.1  # Horizontal extents that differ by a smaller share have an unstable yaw.
 
@@ -163,6 +169,24 @@ class Ground:
         dx[:, 1:-1] = (self.road[:, :-2] - self.road[:, 2:]) / 2
         dy[:, :, 1:-1] = (self.road[:, :, :-2] - self.road[:, :, 2:]) / 2
         return torch.stack([dx * dx - dy * dy, 2 * dx * dy, dx * dx + dy * dy], dim=1)
+
+    @cached_property
+    def edges(self) -> tuple[Float[Tensor, "b 2 rows cols"], Float[Tensor, "b 1 rows cols"]]:
+        """Direction of the nearest edge of the road, as cosine and sine of the doubled angle, and its distance (m)."""
+        factor = max(1, round(EDGE_PIXEL_M / self.spec.grid.resolution_m))
+        pixel_m = factor * self.spec.grid.resolution_m
+        slopes = _blur(F.avg_pool2d(self.slopes, factor), pixel_m)
+        along = -slopes[:, :2] / torch.hypot(slopes[:, 0], slopes[:, 1]).clamp(min=1e-9)[:, None]
+        is_road = F.avg_pool2d(self.road[:, None], factor)[:, 0] > 0.5
+        is_edge = is_road & (F.max_pool2d((~is_road).float()[:, None], 3, 1, 1)[:, 0] > 0)
+        found, distances_m = torch.zeros_like(along), torch.full_like(along[:, :1], torch.inf)
+        for k, mask in enumerate(is_edge.cpu().numpy()):
+            if mask.any():
+                distance, nearest = cast(tuple[np.ndarray, ...], distance_transform_edt(~mask, return_indices=True))
+                row, col = torch.from_numpy(nearest)
+                found[k] = along[k][:, row, col]
+                distances_m[k, 0] = torch.from_numpy(distance * pixel_m)
+        return found, distances_m
 
     def find_classes(self, names: Sequence[str]) -> Float[Tensor, "b rows cols"]:
         """Find the probability that a pixel has at least one of some classes.
@@ -265,6 +289,7 @@ CONSTRAINTS = {
     "height": Constraint((tuple(HEIGHT_TOLERANCE_M),)),
     "support": Constraint((("traffic_control",), SUPPORTER_NAMES)),
     "heading": Constraint((VEHICLE_NAMES,), ROAD_CLASSES),
+    "alignment": Constraint((ALIGNED,), ROAD_CLASSES),
 }
 
 
@@ -562,6 +587,32 @@ def compute_heading(objects: Objects, ground: Ground) -> Float[Tensor, " scenes"
     return _sum_scenes(weight * LANE_LENGTH_M * deviation, some.scene, len(ground.probability))
 
 
+def compute_alignment(objects: Objects, ground: Ground) -> Float[Tensor, " scenes"]:
+    """Sum the deviations of buildings, walls and vehicles from the direction of the nearest edge of the road.
+
+    Directions count modulo pi / 2: an object may be parallel or perpendicular to the edge.
+
+    Args:
+        objects: Objects.
+        ground: Ground.
+
+    Returns:
+        Sum of ALIGNMENT_LENGTH_M * sin^2 of twice the angle, beyond ALIGNMENT_TOLERANCE_RAD (m).
+    """
+    some = objects.take(objects.is_any([CATEGORY_INDEX[name] for name in ALIGNED]))
+    with torch.no_grad():
+        along, distance_m = ground.edges
+        grid, (rows, cols) = ground.spec.grid, along.shape[2:]
+        x_m, y_m = some.center_m[:, :2].unbind(dim=1)
+        row = ((grid.front_m - x_m) / (grid.front_m - grid.back_m) * rows).long().clamp(0, rows - 1)
+        col = ((grid.left_m - y_m) / (grid.left_m - grid.right_m) * cols).long().clamp(0, cols - 1)
+        edge, far_m = along[some.scene, :, row, col], distance_m[some.scene, 0, row, col]
+    cos = (edge * some.double_yaw).sum(dim=1)
+    deviation = (1 - cos.square() - np.sin(2 * ALIGNMENT_TOLERANCE_RAD) ** 2).clamp(min=0)
+    weight = some.existence * (far_m < EDGE_RANGE_M)
+    return _sum_scenes(weight * ALIGNMENT_LENGTH_M * deviation, some.scene, len(ground.probability))
+
+
 def _measure_lanes(ground: Ground, objects: Objects) -> tuple[Tensor, Tensor, Tensor]:
     """Return the direction (n, 2) of the road as cosine and sine of the doubled angle, its coherence, and "on road"."""
     center_m = objects.center_m[:, :2]
@@ -595,6 +646,7 @@ def compute_penalties(objects: Objects, ground: Ground, names: Sequence[str]) ->
         "height": lambda: compute_height(objects, ground),
         "support": lambda: compute_support(objects, scenes),
         "heading": lambda: compute_heading(objects, ground),
+        "alignment": lambda: compute_alignment(objects, ground),
     }
     return {name: compute[name]() for name in names}
 

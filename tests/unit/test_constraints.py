@@ -151,6 +151,28 @@ def test_heading_penalty_of_car_at_30_degrees():
     assert measure(ground, next_to_road)["heading"] == 0
 
 
+def test_alignment_penalty_of_building_at_20_degrees():
+    """The edges of the road run along x; a building may be parallel or perpendicular to them."""
+    ground = make_ground(road=column_mask(4, -4))
+    turned = np.radians(20)
+    expected = np.sin(2 * turned) ** 2 - np.sin(2 * penalties.ALIGNMENT_TOLERANCE_RAD) ** 2
+    for yaw_rad in (turned, -turned, np.pi / 2 + turned):
+        house = ("construction_big", (20, 15, 3), (12, 6, 6), yaw_rad, 0.999999)
+        assert measure(ground, house)["alignment"] == pytest.approx(penalties.ALIGNMENT_LENGTH_M * expected, rel=0.02)
+        assert measure(make_ground(), house)["alignment"] == 0  # There is no road.
+    person = ("human", (20, 15, 1), (0.6, 0.3, 1.8), turned, 0.999999)
+    assert measure(ground, person)["alignment"] == 0
+
+
+def test_alignment_follows_the_nearest_edge():
+    """Beside a road in a corner of the scene that runs at 45 degrees, a building at 45 degrees is aligned."""
+    x_m, y_m = SPEC.grid.x_m()[:, None], SPEC.grid.y_m()[None]
+    ground = make_ground(road=np.abs(x_m - 32 - y_m) < 5)
+    for yaw_rad, is_aligned in ((np.pi / 4, True), (0.0, False)):
+        house = ("construction_big", (45, -5, 3), (12, 6, 6), yaw_rad, 0.999999)
+        assert (measure(ground, house)["alignment"] < 0.01) == is_aligned
+
+
 def test_valid_scene_has_no_penalty():
     ground = make_ground(road=column_mask(4, -4), terrain=column_mask(32, 6))
     boxes = [
@@ -189,6 +211,7 @@ def test_duplicates_are_not_pushed_apart():
             {},
         ),
         ("heading", [(CAR[0], (20, 0, 0.75), CAR[2], 0.5, 0.99)], {"road": column_mask(4, -4)}),
+        ("alignment", [("construction_big", (20, 15, 3), (12, 6, 6), 0.4, 0.99)], {"road": column_mask(4, -4)}),
     ],
 )
 def test_gradient_descent_resolves_penalty(name, boxes, classes):
@@ -226,7 +249,7 @@ def test_gradient_is_finite_for_square_and_concentric_boxes():
 
 def test_constraints_need_categories_of_model():
     cars = LayoutSpec(categories=("vehicle_small", "human"), slots=(4, 4))
-    assert select_constraints(cars) == ("penetration", "height", "heading")
+    assert select_constraints(cars) == ("penetration", "height", "heading", "alignment")
     assert select_constraints(LayoutSpec()) == tuple(penalties.CONSTRAINTS)
     with pytest.raises(ValueError, match="'support' needs at least one of traffic_control, but the model has only"):
         select_constraints(cars, ["support"])
@@ -307,6 +330,14 @@ def test_guidance_runs_in_inference_mode(constrained):
     usual = constrained.sample_latents(LABELS, 3, range(3), 10)
     with torch.inference_mode():
         assert torch.equal(constrained.sample_latents(LABELS, 3, range(3), 10), usual)
+
+
+def test_displacement_has_full_precision_under_autocast(constrained):
+    latents = torch.randn(2, *constrained.latent_shape, generator=torch.Generator().manual_seed(2))
+    guidance = require_guidance(constrained)
+    usual = guidance.find_displacement(latents, 0.3)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(guidance.find_displacement(latents, 0.3), usual)
 
 
 def test_guided_inpainting_keeps_known_latents(constrained):
