@@ -84,9 +84,13 @@ LANE_SPREAD_M = 4.0  # Standard deviation of the Gaussian weights in this window
 LANE_SAMPLES = 17  # Samples along each side of the window.
 LANE_TOLERANCE_RAD = 0.1  # 90 % of the vehicles of town version 1 deviate by less (0.09; version 2: 0.07).
 LANE_LENGTH_M = 2.0  # Converts sin^2 of the angle to metres: half the length of a car.
+
+# Objects that are parallel or perpendicular to the nearest edge of the road.
 ALIGNED = ("vehicle_big", "vehicle_small", "two_wheelers", "construction_big", "construction_small")
 EDGE_PIXEL_M = 1.0  # Resolution of the nearest edges of the road.
 EDGE_RANGE_M = 30.0  # Objects farther from the road have no penalty on their alignment.
+# In 256 test scenes of town version 2, 95 % of the vehicles, 88 % of the walls, 80 % of the buildings and 70 % of the
+# two-wheelers deviate by less.
 ALIGNMENT_TOLERANCE_RAD = 0.1
 ALIGNMENT_LENGTH_M = 2.0  # Converts sin^2 of twice the angle to metres.
 MIN_COHERENCE = 0.5  # Below this coherence, for example at junctions, the road has no direction.

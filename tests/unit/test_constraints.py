@@ -165,7 +165,7 @@ def test_alignment_penalty_of_building_at_20_degrees():
 
 
 def test_alignment_follows_the_nearest_edge():
-    """Beside a road in a corner of the scene that runs at 45 degrees, a building at 45 degrees is aligned."""
+    """The road runs at 45 degrees to the x axis. A building next to the road is aligned if its yaw is 45 degrees."""
     x_m, y_m = SPEC.grid.x_m()[:, None], SPEC.grid.y_m()[None]
     ground = make_ground(road=np.abs(x_m - 32 - y_m) < 5)
     for yaw_rad, is_aligned in ((np.pi / 4, True), (0.0, False)):
