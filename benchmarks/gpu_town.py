@@ -1,7 +1,7 @@
 """Train both networks of the town model on one machine with a GPU, without Ray and without internet access.
 
     python benchmarks/gpu_town.py --output DIR --start-from LVAE --lvae-seconds 180 --dit-seconds 360
-    python benchmarks/gpu_town.py --output DIR --start-from LVAE --cpu --towns 2 --test-towns 1 --lvae-seconds 60
+    python benchmarks/gpu_town.py --output DIR --start-from LVAE --cpu --towns 2 --test-towns 1 --scenes-per-town 8
 
 Processes make town scenes while the layout VAE trains. Then the scenes are encoded, and the diffusion transformer
 trains on the latents. Models, losses and optimisers are those of jobs/train_lvae.py and jobs/train_dit.py, and the
@@ -9,12 +9,12 @@ scenes are those of jobs/preprocess_scenes.py with --town-version 2. For speed, 
 
 * all scenes and latents are kept in GPU memory
 * random numbers are drawn on the GPU, so they differ between devices
-* primitives are matched by the auction algorithm of Bertsekas on the GPU, whose cost is optimal up to AUCTION_STEP per
-  primitive (`match_by_auction`)
+* primitives are matched by the auction algorithm of Bertsekas on the GPU, almost optimally (`match_by_auction`)
 * learning rates follow the clock, so a training ends in time
 
 The layout with its slots and bounds is that of the layout VAE of --start-from. The thresholds of the density labels are
-those of a dataset.json (--thresholds) or of the first scenes.
+those of a dataset.json (--thresholds) or of the training scenes. DIR/latents.json and the files DIR/lvae-*.safetensors
+and DIR/dit-*.safetensors hold the results, in files of at most 15 MB.
 """
 
 from __future__ import annotations
@@ -43,12 +43,13 @@ from models.dit import DiT
 from models.labels import LABELS, compose_label, find_label_index
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTConfig
+from models.presets import DIT_PRESETS, LVAE_PRESETS
 from models.scene import VEGETATION, VEHICLES
 from models.tensors import encode_layout
 from models.training import DiffusionLossConfig, ExecutionConfig, OptimizerConfig, make_dit_settings, make_lvae_settings
 from models.vae import losses
 from models.vae.matching import PAPER_WEIGHTS, MatchWeights, compute_match_cost
+from pipelines.metrics.frechet import Moments, compute_frechet_distance, compute_moments
 from pipelines.preprocess.sources.town.generator import (
     TEST_SEEDS_START,
     TRAIN_SEEDS_START,
@@ -57,7 +58,7 @@ from pipelines.preprocess.sources.town.generator import (
 )
 from pipelines.schema.density_labels import DensityThresholds, classify_density, compute_density_thresholds
 
-SCENES_PER_TOWN, FREE_PER_TOWN = 200, 50
+FREE_POSE_SHARE = 0.25
 HEIGHT_OFFSET = 32768  # Heights are stored as (height + offset) / 2, from 0.5 below the bounds to 0.5 above them.
 AUCTION_STEP = 0.01
 AUCTION_CANDIDATES = 24  # Cheapest proposals of each primitive that take part in the auction.
@@ -65,7 +66,7 @@ AUCTION_ROUNDS = 200
 AUCTION_GROWTH = 1.05  # Growth of the step per round, without which a few primitives would bid for thousands of rounds.
 NOMINAL_STEPS = 10_000  # Steps of the schedules, which are stretched over the time of a training.
 SAVE_SECONDS = 60.0
-EMA_DECAYS = (0.999, 0.99, 0.9997)
+NO_LOGVAR = -60.0  # Log-variance of posteriors that are replaced by their means.
 
 
 # ------------------------------------------------------------------------------------------------------- scenes
@@ -84,12 +85,12 @@ class PackedTown:
     groups: np.ndarray  # (n, 4): count and volume (m3) of vegetation, count and volume of vehicles
 
 
-def pack_town(task: tuple[int, dict[str, Any]]) -> PackedTown:
-    """Make and encode the scenes of a town."""
-    seed, layout = task
-    spec = LayoutSpec.from_dict(layout)
-    drive = generate_town(seed, 2, FREE_PER_TOWN)
-    drive = drive.at(select_town_poses(len(drive), SCENES_PER_TOWN, FREE_PER_TOWN))
+def pack_town(task: tuple[int, int, dict[str, Any]]) -> PackedTown:
+    """Make and encode the scenes of a town: (seed, number of scenes, layout)."""
+    seed, scenes, layout = task
+    spec, num_free = LayoutSpec.from_dict(layout), round(FREE_POSE_SHARE * scenes)
+    drive = generate_town(seed, 2, num_free)
+    drive = drive.at(select_town_poses(len(drive), scenes, num_free))
     bits, heights, features, real, groups = [], [], [], [], []
     for k in range(len(drive)):
         scene = drive.scene(k, grid=spec.grid)
@@ -101,7 +102,7 @@ def pack_town(task: tuple[int, dict[str, Any]]) -> PackedTown:
         real.append(found["real"])
         members = [np.isin(scene.category, group) for group in (VEGETATION, VEHICLES)]
         groups.append([value for m in members for value in (m.sum(), scene.volume_m3[m].sum())])
-    free = np.arange(len(drive)) >= len(drive) - FREE_PER_TOWN
+    free = np.arange(len(drive)) >= len(drive) - num_free
     return PackedTown(
         np.stack(bits),
         np.concatenate(heights),
@@ -114,10 +115,10 @@ def pack_town(task: tuple[int, dict[str, Any]]) -> PackedTown:
 
 
 class Pool:
-    """Scenes in the memory of the device. Processes add towns (`collect`)."""
+    """Scenes of several towns in the memory of the device."""
 
-    def __init__(self, spec: LayoutSpec, towns: int, device: torch.device) -> None:
-        self.spec, self.device, self.capacity = spec, device, towns * SCENES_PER_TOWN
+    def __init__(self, spec: LayoutSpec, capacity: int, device: torch.device) -> None:
+        self.device, self.capacity = device, capacity
         self.shape = (len(spec.ground_classes), spec.grid.rows, spec.grid.cols)
         pixels = int(np.prod(self.shape))
         self.bits = torch.zeros(self.capacity, pixels // 8, dtype=torch.uint8, device=device)
@@ -377,27 +378,31 @@ def compute_channel_statistics(mean: Tensor) -> tuple[list[float], list[float]]:
     return shift.tolist(), (torch.as_tensor(square) / cells - shift**2).clamp(min=1e-12).sqrt().tolist()
 
 
+def draw_latents(model: DiT, data: dict[str, Tensor], index: Tensor) -> Tensor:
+    """Return normalised latents of scenes, drawn from their posteriors like those of the training."""
+    statistics = (model.config.shift, model.config.scale)
+    shift, scale = (torch.tensor(values, device=model.device)[:, None, None] for values in statistics)
+    mean, sigma = data["mean"][index].float(), (0.5 * data["logvar"][index].float()).exp()
+    return (mean + sigma * torch.randn_like(mean) - shift) / scale
+
+
 @torch.no_grad()
-def measure_dit(model: DiT, data: dict[str, Tensor], seed: int = 0) -> list[float]:
-    """Return the mean squared error of v for each of ten timesteps, of 1 for a network that returns zero."""
-    generator = torch.Generator(model.device).manual_seed(seed)
-    shift = torch.tensor(model.config.shift, device=model.device)[:, None, None]
-    scale = torch.tensor(model.config.scale, device=model.device)[:, None, None]
+def measure_dit(model: DiT, data: dict[str, Tensor], scenes: int) -> list[float]:
+    """Return the mean squared error of v for each of ten timesteps; it is 1 for a network that returns zero."""
     errors = []
     for step in range(50, 1000, 100):
-        total, count = 0.0, 0
-        for index in torch.arange(len(data["mean"]), device=model.device).split(256):
-            clean = (data["mean"][index].float() - shift) / scale
-            noise = torch.randn(clean.shape, generator=generator, device=model.device)
+        total = 0.0
+        for index in torch.arange(scenes, device=model.device).split(256):
+            clean = draw_latents(model, data, index)
+            noise = torch.randn_like(clean)
             timestep = torch.full((len(index),), step, device=model.device)
-            noise_share, signal = model.noise_shares[timestep].T[:, :, None, None, None]
+            noise_share, signal = model.noise_shares[step]
             with torch.autocast(model.device.type, torch.bfloat16):
                 noisy = signal * clean + noise_share * noise
                 estimate = model(noisy, timestep, data["label"][index]).float()
             # The network returns the noise. The error of v is the error of the noise divided by the signal.
             total += float((((noise - estimate) / signal) ** 2).flatten(1).mean(1).sum())
-            count += len(index)
-        errors.append(total / count)
+        errors.append(total / scenes)
     return errors
 
 
@@ -424,44 +429,33 @@ def sample_latents(model: DiT, labels: Tensor, steps: int = 25, seed: int = 0) -
 class LatentDistance:
     """Frechet distance of features of latents, for comparisons of trainings with the same layout VAE.
 
-    A random convolutional network computes the features: the mean of each channel over the latent. The latents of
-    scenes are drawn from their posteriors, like those of the training. The ceiling is the distance of the test split.
+    A random convolutional network computes the features: the mean of each channel over the latent. The ceiling is the
+    distance of the test split.
     """
 
     def __init__(self, data: dict[str, Tensor], test: dict[str, Tensor], model: DiT) -> None:
-        device = data["mean"].device
         generator = torch.Generator().manual_seed(0)
-        channels = data["mean"].shape[1]
+        channels, device = model.config.channels, model.device
         self.first = (torch.randn(96, channels, 3, 3, generator=generator) / (9 * channels) ** 0.5).to(device)
         self.second = (torch.randn(192, 96, 3, 3, generator=generator) / (9 * 48) ** 0.5).to(device)
-        self.shift = torch.tensor(model.config.shift, device=device)[:, None, None]
-        self.scale = torch.tensor(model.config.scale, device=device)[:, None, None]
         chosen = torch.randperm(len(data["mean"]), device=device)[:20_000]
-        self.real = self.summarise(self.draw(data, part) for part in chosen.split(1000))
+        self.real = self.summarise(draw_latents(model, data, part) for part in chosen.split(1000))
         some = torch.arange(len(test["mean"]), device=device)
-        self.ceiling = self.measure(self.summarise(self.draw(test, part) for part in some.split(1000)))
-
-    def draw(self, data: dict[str, Tensor], index: Tensor) -> Tensor:
-        """Return normalised latents of scenes, drawn from their posteriors."""
-        mean, sigma = data["mean"][index].float(), (0.5 * data["logvar"][index].float()).exp()
-        return (mean + sigma * torch.randn_like(mean) - self.shift) / self.scale
+        self.ceiling = self.measure(draw_latents(model, test, part) for part in some.split(1000))
 
     @torch.no_grad()
-    def summarise(self, latents: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return mean and covariance of the features of normalised latents, which come in parts."""
+    def summarise(self, latents: Iterable[Tensor]) -> Moments:
+        """Return the moments of the features of normalised latents, which come in parts."""
         found = []
         for x in latents:
             x = torch.nn.functional.conv2d(x, self.first, stride=1).relu()
             x = torch.nn.functional.conv2d(x, self.second, stride=2).relu()
-            found.append(x.mean(dim=(2, 3)))
-        features = torch.cat(found).double()
-        return features.mean(dim=0), features.T.cov()
+            found.append(x.mean(dim=(2, 3)).double().cpu().numpy())
+        return compute_moments(np.concatenate(found))
 
-    def measure(self, other: tuple[Tensor, Tensor]) -> float:
-        """Return the Frechet distance between these features and those of the training split."""
-        (mean, cov), (own, own_cov) = other, self.real
-        product = torch.linalg.eigvals(cov @ own_cov).real.clamp(min=0).sqrt().sum()
-        return float(((mean - own) ** 2).sum() + cov.trace() + own_cov.trace() - 2 * product)
+    def measure(self, latents: Iterable[Tensor]) -> float:
+        """Return the Frechet distance between latents and those of the training split."""
+        return compute_frechet_distance(self.real, self.summarise(latents))
 
 
 @dataclass(frozen=True)
@@ -482,10 +476,9 @@ class DiTRun:
         self.distance = LatentDistance(data, test, dit)
         self.labels = test["label"]
         self.copy = DiT.from_config(dit.config).to(dit.device).eval()
-        log(f"distance of the test split: {self.distance.ceiling:.4f}")
 
     def train(self, variant: Variant, start: dict[str, Tensor], save: bool = False) -> tuple[dict[str, Tensor], float]:
-        """Train from `start`. Return the best weights, and the smallest distance of its samples."""
+        """Train from `start`. Return the averaged weights, and the distance of samples."""
         setup, preset, size = self.setup, DIT_PRESETS["town"], variant.batch
         dit = DiT.from_config(self.dit.config).to(self.dit.device)
         dit.load_state_dict({**dit.state_dict(), **start})
@@ -495,7 +488,6 @@ class DiTRun:
             learning_rate=setup.dit_rate,
             final_learning_rate=1e-5,
             warmup_steps=NOMINAL_STEPS // 50,
-            ema_decay=None,
         )
         trainer = training.make_dit_trainer(
             dit,
@@ -505,20 +497,14 @@ class DiTRun:
             execution=ExecutionConfig(precision="bf16", compile=setup.compile),
             loss_config=variant.loss,
         )
-        averages = {decay: {k: v.detach().clone() for k, v in trainer.parameters.items()} for decay in EMA_DECAYS}
         found: list[float] = []
-        saved, count = time.perf_counter(), 0
+        saved = time.perf_counter()
         order = torch.zeros(0, dtype=torch.long, device=dit.device)
         while is_running():
             if len(order) < size:
                 order = torch.cat([order, torch.randperm(len(self.data["mean"]), device=order.device)])
             index, order = order[:size], order[size:]
             result = trainer.step({name: value[index] for name, value in self.data.items()}, range(size))
-            with torch.no_grad():
-                for decay, average in averages.items():
-                    share = 1 - min(decay, 1 - (1 + trainer.steps_done) ** -0.75)
-                    lerp = torch._foreach_lerp_  # pyright: ignore[reportPrivateImportUsage]
-                    lerp(list(average.values()), list(trainer.parameters.values()), share)
             if trainer.steps_done % 20 == 0:
                 found.append(float(result["noise_error"]))
             if trainer.steps_done % setup.log_every == 0 and found:
@@ -526,38 +512,24 @@ class DiTRun:
                 log(f"{variant.name}, step {trainer.steps_done}: noise error {np.mean(found):.4f}, rate {rate:.1e}")
                 found.clear()
             if save and time.perf_counter() - saved > SAVE_SECONDS:
-                save_parts(averages[EMA_DECAYS[0]], setup.output / "dit", torch.float16)
-                saved, count = time.perf_counter(), count + 1
-                distance = self.measure(averages[EMA_DECAYS[0]])
-                log(f"{variant.name}, step {trainer.steps_done}, EMA {EMA_DECAYS[0]}: distance {distance:.4f}")
+                save_parts(trainer.ema or {}, setup.output / "dit", torch.float16)
+                saved = time.perf_counter()
         log(f"{variant.name}: {trainer.steps_done} steps of {size}")
-        options = {f"EMA {decay}": average for decay, average in averages.items()}
+        weights = trainer.ema or {}
         if save:
-            options["no EMA"] = {name: value.detach().clone() for name, value in trainer.parameters.items()}
-        else:
-            options = {f"EMA {EMA_DECAYS[0]}": averages[EMA_DECAYS[0]]}
-        best, smallest = averages[EMA_DECAYS[0]], np.inf
-        for name, weights in options.items():
-            distance = self.measure(weights)
-            errors = [measure_dit(self.copy, part) for part in (self.test, self.draw_train())]
-            text = "  ".join(
-                f"{split} {np.mean(error):.4f} {np.round(error, 3).tolist()}"
-                for split, error in zip(("test", "train"), errors, strict=True)
-            )
-            log(f"{variant.name}, {name}: distance {distance:.4f}; error of v: {text}")
-            if distance < smallest:
-                best, smallest = weights, distance
-        if save:
-            save_parts(best, setup.output / "dit", torch.float16)
-        return best, smallest
-
-    def draw_train(self) -> dict[str, Tensor]:
-        return {name: value[: len(self.test["mean"])] for name, value in self.data.items()}
+            save_parts(weights, setup.output / "dit", torch.float16)
+        distance = self.measure(weights)
+        scenes = len(self.test["mean"])
+        for split, data in (("test", self.test), ("train", self.data)):
+            error = measure_dit(self.copy, data, min(scenes, len(data["mean"])))
+            log(f"{variant.name}: error of v, {split}: {np.mean(error):.4f} {np.round(error, 3).tolist()}")
+        log(f"{variant.name}: distance {distance:.4f} (test split: {self.distance.ceiling:.4f})")
+        return weights, distance
 
     def measure(self, weights: dict[str, Tensor]) -> float:
         """Return the distance of samples of a network with these weights, which `self.copy` keeps."""
         self.copy.load_state_dict({**self.dit.state_dict(), **weights})
-        return self.distance.measure(self.distance.summarise(sample_latents(self.copy, self.labels).split(1000)))
+        return self.distance.measure(sample_latents(self.copy, self.labels).split(1000))
 
 
 def parse_arguments() -> argparse.Namespace:
@@ -566,8 +538,9 @@ def parse_arguments() -> argparse.Namespace:
     add("--output", type=Path, required=True, help="directory of the weights")
     add("--start-from", required=True, help="layout VAE whose layout and weights are used")
     add("--thresholds", default="", help="dataset.json with the thresholds of the labels")
-    add("--towns", type=int, default=600, help="towns of the training split, each with 200 scenes")
+    add("--towns", type=int, default=600, help="towns of the training split")
     add("--test-towns", type=int, default=4, help="towns of the test split")
+    add("--scenes-per-town", type=int, default=200, help="scenes of each town, at most 200")
     add("--processes", type=int, default=max((os.cpu_count() or 1) - 2, 1), help="processes that make scenes")
     add("--first-towns", type=int, default=32, help="towns that the training of the layout VAE waits for")
     add("--lvae-seconds", type=float, default=180.0, help="time of the training of the layout VAE")
@@ -577,10 +550,7 @@ def parse_arguments() -> argparse.Namespace:
     add("--compare-seconds", type=float, default=0.0, help="time of each short training before it; 0: none")
     add("--dit-batch", type=int, default=256)
     add("--dit-rate", type=float, default=1e-3)
-    add("--depth", type=int, default=8)
-    add("--width", type=int, default=288)
-    add("--heads", type=int, default=6)
-    add("--means", action="store_true", help="train the transformer on means of the posteriors")
+    add("--sample-posterior", action="store_true", help="draw latents from the posteriors, instead of their means")
     add("--timestep-sampling", choices=("uniform", "logit_normal"), default="uniform")
     add("--no-compile", dest="compile", action="store_false")
     add("--log-every", type=int, default=200)
@@ -591,19 +561,24 @@ def parse_arguments() -> argparse.Namespace:
 
 def main() -> None:
     setup = parse_arguments()
+    if not setup.cpu and not torch.cuda.is_available():
+        raise SystemExit("error: this machine has no GPU; add --cpu for a rehearsal")
+    try:
+        model = LayoutVAE.from_pretrained(setup.start_from)
+    except (OSError, ValueError) as error:
+        raise SystemExit(f"error: --start-from {setup.start_from}: no layout VAE here ({error})") from error
     setup.output.mkdir(parents=True, exist_ok=True)
     device = torch.device("cpu" if setup.cpu else "cuda")
     torch.manual_seed(setup.seed)
     torch.backends.cudnn.allow_tf32 = False  # Positions need the precision of float32.
     draw_on_device()
-    model = LayoutVAE.from_pretrained(setup.start_from)
     layout = dict(model.config.layout)
     spec = model.spec
     with multiprocessing.get_context("spawn").Pool(setup.processes, os.nice, (10,)) as workers:
         seeds = [*range(TEST_SEEDS_START, TEST_SEEDS_START + setup.test_towns)]
         seeds += range(TRAIN_SEEDS_START, TRAIN_SEEDS_START + setup.towns)
-        made = workers.imap(pack_town, [(seed, layout) for seed in seeds], chunksize=1)
-        pool, test = Pool(spec, setup.towns, device), Pool(spec, setup.test_towns, device)
+        made = workers.imap(pack_town, [(seed, setup.scenes_per_town, layout) for seed in seeds], chunksize=1)
+        pool, test = (Pool(spec, n * setup.scenes_per_town, device) for n in (setup.towns, setup.test_towns))
         for _ in range(setup.test_towns):
             test.add(next(made))
         for _ in range(min(setup.first_towns, setup.towns)):
@@ -634,15 +609,14 @@ def main() -> None:
     names = ("mean", "logvar")
     data = dict(zip(names, encode(model, pool, 256), strict=True)) | {"label": pool.labels(thresholds)}
     tested = dict(zip(names, encode(model, test, 256), strict=True)) | {"label": test.labels(thresholds)}
-    if setup.means:  # The comparison of distributions uses the same latents as the training.
+    if not setup.sample_posterior:
         for part in (data, tested):
-            part["logvar"].fill_(-60)
+            part["logvar"].fill_(NO_LOGVAR)
     shift, scale = compute_channel_statistics(data["mean"])
     (setup.output / "latents.json").write_text(json.dumps({"channel_mean": shift, "channel_std": scale}))
     del pool, test
     log(f"{len(data['mean'])} latents; labels", torch.bincount(data["label"], minlength=32).tolist())
     channels, size, _ = model.latent_shape
-    config = DiTConfig(2, setup.depth, setup.width, setup.heads, "v_prediction")
     dit = DiT(
         channels=channels,
         size=size,
@@ -651,19 +625,17 @@ def main() -> None:
         num_labels=len(LABELS["partial"]),
         shift=shift,
         scale=scale,
-        **replace(DIT_PRESETS["town"], model=config).architecture(),
+        **DIT_PRESETS["town"].architecture(),
     ).to(device)
     log(f"transformer with {sum(p.numel() for p in dit.parameters()) / 1e6:.2f} million parameters")
     run = DiTRun(setup, dit, data, tested)
     start = dict(dit.state_dict())
-    posterior = not setup.means
-    loss = DiffusionLossConfig(setup.timestep_sampling, sample_posterior=posterior)
-    chosen = Variant("chosen", setup.dit_seconds, setup.dit_batch, loss)
+    chosen = Variant("chosen", setup.dit_seconds, setup.dit_batch, DiffusionLossConfig(setup.timestep_sampling))
     if setup.compare_seconds:
         losses_of = {
-            "uniform": DiffusionLossConfig(sample_posterior=posterior),
-            "min-snr": DiffusionLossConfig(loss_weighting="min_snr", sample_posterior=posterior),
-            "logit-normal": DiffusionLossConfig("logit_normal", sample_posterior=posterior),
+            "uniform": DiffusionLossConfig(),
+            "min-snr": DiffusionLossConfig(loss_weighting="min_snr"),
+            "logit-normal": DiffusionLossConfig("logit_normal"),
         }
         variants = [Variant(k, setup.compare_seconds, setup.dit_batch, loss) for k, loss in losses_of.items()]
         variants.append(Variant("uniform, small batch", setup.compare_seconds, setup.dit_batch // 4))

@@ -47,13 +47,11 @@ def test_auction_finds_almost_the_cheapest_assignment(spread):
             assert best - 1e-6 <= cost[sample, rows[mine], columns[mine]].sum() <= best + 0.5 * n
 
 
-def test_pool_returns_encoded_scenes(monkeypatch):
-    monkeypatch.setattr(gpu_town, "SCENES_PER_TOWN", 4)
-    monkeypatch.setattr(gpu_town, "FREE_PER_TOWN", 1)
+def test_pool_returns_encoded_scenes():
     spec = LayoutSpec().with_resolution(64)
-    pool = gpu_town.Pool(spec, 2, torch.device("cpu"))
+    pool = gpu_town.Pool(spec, 8, torch.device("cpu"))
     for seed in (3, 1_000_000):
-        pool.add(gpu_town.pack_town((seed, spec.to_dict())))
+        pool.add(gpu_town.pack_town((seed, 4, spec.to_dict())))
     assert pool.size == 8
     drive = generate_town(1_000_000, 2, 1)
     drive = drive.at(select_town_poses(len(drive), 4, 1))
