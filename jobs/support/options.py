@@ -28,8 +28,8 @@ IfBusyOption = Annotated[
 ConstraintsOption = Annotated[
     bool | None,
     tyro.conf.arg(
-        help="Guide sampling by constraints, so that objects overlap, float and block roads less often and follow the streets; write"
-        " --constraints or --no-constraints (default: as the model stores)."
+        help="Guide sampling by constraints, so that objects overlap, float and block roads less often and follow the"
+        " streets; write --constraints or --no-constraints (default: as the model stores)."
     ),
 ]
 GpusOption = Annotated[
