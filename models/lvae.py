@@ -20,6 +20,7 @@ from models.vae.config import Branches, GroundConfig, LayoutVAEConfig, ObjectCon
 from models.vae.detr_decoder import DETRDecoder
 from models.vae.ground import GroundDecoder, GroundEncoder, compute_edge_reach_px, init_from_data
 from models.vae.level_sets import LevelSetDecoder, init_level_sets
+from models.vae.local_frame import LocalFrame
 from models.vae.matching import MatchWeights
 from models.vae.objects import ObjectEncoder
 from models.vae.outputs import LayoutOutput, Posterior, Proposals
@@ -61,6 +62,7 @@ class LayoutVAE(ConfiguredModel):
         split_latent: See `LayoutVAEConfig`.
         branches: "both", "ground" or "objects". If a model has only one branch, its latent has c channels. In its
             decoded layouts, the part of the other branch is empty.
+        local_frame: See `LayoutVAEConfig`. It needs both branches, the cell decoder and a ground class "road".
 
     Raises:
         ValueError: An option is unknown, or the grid does not divide into latent cells.
@@ -76,6 +78,7 @@ class LayoutVAE(ConfiguredModel):
         shortcut: bool = False,
         split_latent: bool = True,
         branches: Branches | str = "both",
+        local_frame: bool = False,
     ) -> None:
         super().__init__()
         if branches not in BRANCHES:
@@ -89,6 +92,9 @@ class LayoutVAE(ConfiguredModel):
             )
         size, num_classes = spec.grid.rows // ground.cell_px, len(spec.ground_classes)
         cell_m = spec.grid.rows * spec.grid.resolution_m / size
+        if local_frame and (branches != "both" or objects.decoder != "cells"):
+            raise ValueError("LayoutVAE: local_frame needs both branches and the decoder 'cells'")
+        self.local_frame = LocalFrame(spec) if local_frame else None
         self.feature_unit = {  # Unit of distances in losses.
             "normalised": (1.0,) * FEATURES,
             "metres": spec.feature_unit(1.0),
@@ -229,7 +235,11 @@ class LayoutVAE(ConfiguredModel):
             maps = torch.cat([batch.height, batch.occupied], dim=1)
             moments.append(self.ground_encoder(maps, distance).chunk(2, 1))
         if self.object_encoder:
-            moments.append(self.object_encoder(batch.features, batch.real).chunk(2, 1))
+            features = batch.features
+            if self.local_frame:
+                field = self.local_frame.compute_field(batch.height, batch.occupied > 0.5)
+                features = torch.where(batch.real[..., None], self.local_frame.to_local(features, field), features)
+            moments.append(self.object_encoder(features, batch.real).chunk(2, 1))
         mean, logvar = (torch.cat(part, dim=1) for part in zip(*moments, strict=True))
         return Posterior(mean, logvar.clamp(-30, 20))
 
@@ -260,7 +270,8 @@ class LayoutVAE(ConfiguredModel):
         """
         ground, objects = self.split(latent)
         height, occupancy_logit, distance = self.decode_ground(ground, raster_px)
-        found, decoder = self.decode_objects(objects, noised, real), self.object_decoder
+        local_field = self.compute_local_field(ground, height, occupancy_logit)
+        found, decoder = self.decode_objects(objects, local_field, noised, real), self.object_decoder
         return LayoutOutput(
             height,
             occupancy_logit,
@@ -274,6 +285,7 @@ class LayoutVAE(ConfiguredModel):
             found.denoised,
             distance,
             self.reach_px,
+            local_field,
         )
 
     def split(self, latent: Float[Tensor, "batch c2 h w"]) -> tuple[Tensor, Tensor]:
@@ -319,13 +331,42 @@ class LayoutVAE(ConfiguredModel):
         height = latent.new_zeros(len(latent), len(self.spec.ground_classes), grid.rows, grid.cols)
         return height, torch.full_like(height, EMPTY_LOGIT), None
 
+    @torch.no_grad()
+    def compute_local_field(
+        self,
+        latent: Float[Tensor, "batch c h w"],
+        height: Float[Tensor, "batch ground rows cols"],
+        occupancy_logit: Float[Tensor, "batch ground rows cols"],
+    ) -> Tensor | None:
+        """Compute the direction of the streets and the height of the ground of decoded grounds.
+
+        Args:
+            latent: Channels that the ground decoder reads.
+            height: Decoded heights.
+            occupancy_logit: Decoded occupancy. If it has not the resolution of the LayoutSpec, the ground is decoded
+                again, so objects do not depend on the resolution of the rasters.
+
+        Returns:
+            Field for `decode_objects`; None without a local frame.
+        """
+        if self.local_frame is None:
+            return None
+        if occupancy_logit.shape[2] != self.spec.grid.rows:
+            height, occupancy_logit, _ = self.decode_ground(latent)
+        return self.local_frame.compute_field(height, occupancy_logit > 0)
+
     def decode_objects(
-        self, latent: Float[Tensor, "batch c h w"], noised: Tensor | None = None, real: Tensor | None = None
+        self,
+        latent: Float[Tensor, "batch c h w"],
+        local_field: Tensor | None = None,
+        noised: Tensor | None = None,
+        real: Tensor | None = None,
     ) -> Proposals:
         """Decode the objects.
 
         Args:
             latent: Channels that the object decoder reads.
+            local_field: Output of `compute_local_field`.
             noised: (batch, groups, N, 9) features of true primitives with noise, for denoising queries.
             real: (batch, N); True for each slot that holds a primitive.
 
@@ -335,7 +376,10 @@ class LayoutVAE(ConfiguredModel):
         if isinstance(self.object_decoder, DETRDecoder):
             return self.object_decoder(latent, noised, real)
         if self.object_decoder:
-            return self.object_decoder(latent)
+            found = self.object_decoder(latent)
+            if self.local_frame is None or local_field is None:
+                return found
+            return found._replace(features=self.local_frame.to_scene(found.features, local_field))
         features = latent.new_zeros(len(latent), 0, FEATURES)
         return Proposals(features, features[..., 0])
 

@@ -234,12 +234,12 @@ class ConstraintGuidance:
             output.features, output.existence_logit, output.proposals, self.lvae.spec, self.lvae.proposes_duplicates
         )
         existence = output.existence_logit[chosen].float().sigmoid()
-        return _Start(make_ground(output, self.lvae.spec), chosen, existence, output.proposals)
+        return _Start(make_ground(output, self.lvae.spec), chosen, existence, output.proposals, output.local_field)
 
     def _measure_each(self, latent: Tensor, start: _Start) -> tuple[dict[str, Tensor], Tensor]:
         """Return the penalties of latents (m), and squared changes (b,) of existence since the start."""
         shift, scale = self.moments()
-        found = self.lvae.decode_objects(self.lvae.split(latent * scale + shift)[1])
+        found = self.lvae.decode_objects(self.lvae.split(latent * scale + shift)[1], start.local_field)
         objects = make_objects(found.features, found.existence_logit, start.proposals, self.lvae.spec, start.chosen)
         change = (found.existence_logit[start.chosen].float().sigmoid() - start.existence).square()
         total = change.new_zeros(len(latent)).index_add(0, start.chosen[0], change)
@@ -259,3 +259,4 @@ class _Start(NamedTuple):
     chosen: tuple[Tensor, Tensor]
     existence: Tensor
     proposals: tuple[int, ...]
+    local_field: Tensor | None

@@ -21,6 +21,7 @@ RULES: dict[str, Rule] = {
     "shortcut": Flag(),
     "split_latent": Flag(),
     "branches": Choice(get_args(Branches)),
+    "local_frame": Flag(),
 }
 GROUND_RULES: dict[str, Rule] = {
     "channels": Sequential(WIDTH, 1, 12),
@@ -130,6 +131,9 @@ class LayoutVAEConfig:
         split_latent: If True, each decoder reads only its half of the latent channels, as in the paper. If False, both
             decoders read all channels.
         branches: "both". An ablation model with only one branch uses "ground" or "objects".
+        local_frame: If True, object latents hold the yaw of primitives relative to the streets and their height
+            relative to the ground (models/vae/local_frame.py). Otherwise, they hold both in the scene frame, as in the
+            paper.
     """
 
     latent_channels: int = 32
@@ -138,6 +142,7 @@ class LayoutVAEConfig:
     shortcut: bool = False
     split_latent: bool = True
     branches: Branches = "both"
+    local_frame: bool = False
 
 
 # Maps the flat option names of versions before 0.2 to a branch and the current name.

@@ -92,6 +92,8 @@ class LayoutOutput:
         signed_distance: Signed distances from the edges of the masks in units of `reach_px` pixels, positive inside;
             None for models without level sets.
         reach_px: Unit of `signed_distance` in pixels.
+        local_field: Direction of the streets and height of the ground (models/vae/local_frame.py); None for models
+            without a local frame.
     """
 
     height: Float[Tensor, "batch ground rows cols"]
@@ -106,6 +108,7 @@ class LayoutOutput:
     denoised: tuple[Prediction, ...] = ()
     signed_distance: Float[Tensor, "batch ground rows cols"] | None = None
     reach_px: int = 1
+    local_field: Float[Tensor, "batch 3 coarse coarse"] | None = None
 
     def float(self) -> LayoutOutput:
         """Convert to float32, because losses need more precision than bfloat16."""
