@@ -2,8 +2,8 @@
 
 * `smoke` trains within seconds, for tests.
 * `demo` trains on two CPU cores; the layout VAE takes half an hour and the transformer three hours.
-* `town` has level sets and finer rasters. The layout VAE takes three to four hours on one CPU core and the transformer
-  longer.
+* `town` has level sets, a local frame and finer rasters. The layout VAE takes three to four hours on one CPU core and
+  the transformer longer.
 * `kitti360` and `av2` are the paper's models (supplement B.2 and B.3). `kitti360-mini` rehearses them on two cores.
 """
 
@@ -76,6 +76,7 @@ TOWN = LayoutVAEConfig(
     GroundConfig((32, 64), 8, 4, attention=False, level_sets=True),
     replace(SMALL_CELLS, order_in_cell=True),
     shortcut=True,
+    local_frame=True,
 )
 PIXELS = LayoutVAEConfig(32, GroundConfig((32,), 8, 8, attention=False), SMALL_CELLS, shortcut=True)
 MINI = LayoutVAEConfig(32, GroundConfig((8, 16, 32, 64), 4), ObjectConfig(128, 3, 4, 256, 256))
