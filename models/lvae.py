@@ -235,9 +235,8 @@ class LayoutVAE(ConfiguredModel):
             maps = torch.cat([batch.height, batch.occupied], dim=1)
             moments.append(self.ground_encoder(maps, distance).chunk(2, 1))
         if self.object_encoder:
-            features = batch.features
-            if self.local_frame:
-                field = self.local_frame.compute_field(batch.height, batch.occupied > 0.5)
+            features, field = batch.features, self.measure_local_field(batch)
+            if self.local_frame and field is not None:
                 features = torch.where(batch.real[..., None], self.local_frame.to_local(features, field), features)
             moments.append(self.object_encoder(features, batch.real).chunk(2, 1))
         mean, logvar = (torch.cat(part, dim=1) for part in zip(*moments, strict=True))
@@ -249,6 +248,7 @@ class LayoutVAE(ConfiguredModel):
         noised: Tensor | None = None,
         real: Tensor | None = None,
         raster_px: int | None = None,
+        local_field: Tensor | None = None,
     ) -> LayoutOutput:
         """Decode latents to layouts.
 
@@ -261,6 +261,8 @@ class LayoutVAE(ConfiguredModel):
             real: (batch, N); True for each slot that holds a primitive.
             raster_px: Number of rows and of columns of the rasters; None: that of the LayoutSpec. Only level sets have
                 another resolution.
+            local_field: Field of the local frame (`measure_local_field`); None: that of the decoded ground. Training
+                uses the field of the true ground, so errors of the ground do not become errors of the objects.
 
         Returns:
             Output of both decoders.
@@ -270,7 +272,8 @@ class LayoutVAE(ConfiguredModel):
         """
         ground, objects = self.split(latent)
         height, occupancy_logit, distance = self.decode_ground(ground, raster_px)
-        local_field = self.compute_local_field(ground, height, occupancy_logit)
+        if local_field is None:
+            local_field = self.compute_local_field(ground, height, occupancy_logit)
         found, decoder = self.decode_objects(objects, local_field, noised, real), self.object_decoder
         return LayoutOutput(
             height,
@@ -330,6 +333,19 @@ class LayoutVAE(ConfiguredModel):
             return height, logit, None
         height = latent.new_zeros(len(latent), len(self.spec.ground_classes), grid.rows, grid.cols)
         return height, torch.full_like(height, EMPTY_LOGIT), None
+
+    def measure_local_field(self, batch: LayoutBatch) -> Tensor | None:
+        """Compute the direction of the streets and the height of the ground of layouts.
+
+        Args:
+            batch: Layouts.
+
+        Returns:
+            Field for `decode_objects`; None without a local frame.
+        """
+        if self.local_frame is None:
+            return None
+        return self.local_frame.compute_field(batch.height, batch.occupied > 0.5)
 
     @torch.no_grad()
     def compute_local_field(
@@ -416,4 +432,4 @@ class LayoutVAE(ConfiguredModel):
             center, cholesky = DENOISING_NOISE
             scale = self.spec.feature_unit(center)[:3] + self.spec.feature_unit(cholesky**2)[3:]
             noised = (batch.features[:, None] + query_noise * query_noise.new_tensor(scale)).clamp(0, 1)
-        return self.decode(latent, noised, batch.real), posterior
+        return self.decode(latent, noised, batch.real, local_field=self.measure_local_field(batch)), posterior

@@ -150,6 +150,15 @@ def test_decoded_objects_do_not_depend_on_resolution():
     assert (plain.decode(latent).features - own.features)[..., 2:].abs().max() > 0.05
 
 
+def test_training_uses_field_of_true_ground():
+    lvae, batch = make_lvae(), make_layout_batch([random_scene(0), random_scene(1)], small_spec())
+    output, posterior = lvae(batch, torch.zeros(2, *lvae.latent_shape))
+    field = lvae.measure_local_field(batch)
+    assert torch.equal(output.features, lvae.decode(posterior.mean, local_field=field).features)
+    assert not torch.allclose(output.features, lvae.decode(posterior.mean).features, atol=1e-3)
+    assert make_lvae(local_frame=False).measure_local_field(batch) is None
+
+
 @pytest.mark.parametrize("changes", [{"branches": "objects"}, {"objects": {"decoder": "detr"}}])
 def test_local_frame_needs_ground_and_cells(changes):
     with pytest.raises(ValueError, match="local_frame needs both branches and the decoder 'cells'"):
