@@ -83,6 +83,8 @@ class Config:
     """Compile the transformer's block with torch.compile, which takes some seconds; useful on GPUs."""
     checkpoint_every: int | None = None
     """Number of steps between checkpoints (default: a twentieth of the run, at least four steps)."""
+    round_weights: bool = False
+    """Round the weights of the result to float16, so its files need half the space."""
     seed: int = 0
     """Random seed."""
 

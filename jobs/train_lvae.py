@@ -82,6 +82,8 @@ class Config:
     """Augmentation: mirror half of the scenes left to right."""
     jitter: bool = False
     """Augmentation: move the vehicle by up to 1 m and rotate it by up to 2.5 degrees, as in SLEDGE."""
+    round_weights: bool = False
+    """Round the weights of the result to float16, so its files need half the space."""
     seed: int = 0
     """Random seed."""
 

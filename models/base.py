@@ -355,6 +355,8 @@ class ConfiguredModel(nn.Module):
     def save_pretrained(self, directory: str | os.PathLike) -> None:
         """Write config.json and diffusion_pytorch_model.safetensors into a directory.
 
+        The file holds float16 values if they equal the weights (`round_to_float16`).
+
         Args:
             directory: Output directory. The directory is created if it does not exist.
         """
@@ -362,7 +364,23 @@ class ConfiguredModel(nn.Module):
         path.mkdir(parents=True, exist_ok=True)
         write_config(type(self).__name__, self.config, path / CONFIG_NAME)
         state = {name: value.detach().contiguous() for name, value in self.state_dict().items()}
+        halves = {name: value.half() for name, value in state.items()}
+        if all(torch.equal(halves[name].to(value.dtype), value) for name, value in state.items()):
+            state = halves
         save_file(state, path / WEIGHTS_NAME, metadata={"format": "pt"})
+
+    @torch.no_grad()
+    def round_to_float16(self) -> None:
+        """Round the weights to values that float16 represents, so `save_pretrained` writes half as many bytes.
+
+        Raises:
+            ValueError: A weight exceeds the range of float16.
+        """
+        limit = torch.finfo(torch.float16).max
+        for name, value in self.named_parameters():
+            if value.abs().max() > limit:
+                raise ValueError(f"{name} contains a weight of {float(value.abs().max()):g}; float16 ends at {limit:g}")
+            value.copy_(value.half())
 
     def register_to_config(self, **changes: Any) -> None:
         """Replace entries of the config.

@@ -86,6 +86,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     check_training_labels(shards, label_kind)
     training = TrainingRun(
         name=name,
+        round_weights=config.round_weights,
         storage_path=home_path("runs"),
         build=partial(build, architecture, settings, execution, row.label_dropout, start, loss_config),
         stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
@@ -214,6 +215,8 @@ def make_run_identity(
         identity |= {"loss_weighting": loss.loss_weighting}
     if loss.sample_posterior != paper.sample_posterior:
         identity |= {"sample_posterior": loss.sample_posterior}
+    if config.round_weights:
+        identity |= {"round_weights": True}
     return identity
 
 

@@ -88,6 +88,7 @@ def prepare(config: Config) -> TrainingRun:
     sample = sample_layouts(shards, counts, spec)
     return TrainingRun(
         name=name,
+        round_weights=config.round_weights,
         storage_path=home_path("runs"),
         build=partial(
             build,
@@ -156,6 +157,10 @@ def make_run_identity(
         identity |= {"least_per_cell": least}
     if row.model.objects.order_in_cell:
         identity |= {"order_in_cell": True}
+    if row.model.local_frame:
+        identity |= {"local_frame": True}
+    if config.round_weights:
+        identity |= {"round_weights": True}
     return identity
 
 

@@ -5,6 +5,7 @@ The same command resumes a run, because Ray Train finds the run of the same name
 
 from __future__ import annotations
 
+import copy
 import logging
 import os
 import tempfile
@@ -50,7 +51,8 @@ class TrainingRun:
 
     The function `build(device, wrap)` returns the Trainer. The function `validate(trainer)` returns metrics and
     pictures (arrays by name); it runs on rank 0 at every checkpoint. The field `identity` holds the options that must
-    not change when a run is resumed.
+    not change when a run is resumed. With `round_weights`, weights of results are rounded to float16; training itself
+    does not change.
     """
 
     name: str
@@ -64,6 +66,7 @@ class TrainingRun:
     checkpoint_every: int
     log_every: int
     validate: Callable[[Trainer], tuple[dict[str, float], dict[str, np.ndarray]]] | None = None
+    round_weights: bool = False
 
 
 def convert_to_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
@@ -230,6 +233,9 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
         for name, image in pictures.items():
             run.tracker.picture(image, f"{name}/step-{trainer.steps_done:07d}.png")
     model = trainer.ema_model()
+    if run.round_weights:
+        model = copy.deepcopy(model)  # Without moving average, this is the model that is trained.
+        model.round_to_float16()
     tag_weights(run.tracker, model, trainer.steps_done)
     with tempfile.TemporaryDirectory() as directory:
         trainer.save(directory)

@@ -63,10 +63,13 @@ class TrainingRecord:
         series = {name: (steps, values) for name, (steps, values) in self.curves.items()}
         return Chart(f"{self.stage}: losses", series, "training step", "loss", log_y=True)
 
-    def rows(self) -> Iterator[tuple[str, str]]:
+    def rows(self, data: Mapping) -> Iterator[tuple[str, str]]:
+        """Return the rows of the card. `data` holds the options of the dataset of the evaluation."""
         if self.parameters is not None:
             yield "parameters", f"{self.parameters:,}"
         yield "training steps", f"{self.steps:,}"
+        if self.data and self.data.get("num_train") != data.get("num_train"):
+            yield "training scenes", f"{self.data['num_train']:,}"
         yield "training time, h", f"{self.hours:.1f}"
         yield from self.origin.items()
         yield "options", ", ".join(f"{key} {value}" for key, value in self.options.items() if key not in HIDDEN)
@@ -136,7 +139,7 @@ class ModelCard:
         yield f"```json\n{json.dumps({k: v for k, v in self.dataset['options'].items() if k != 'input'})}\n```\n"
         for training in self.trainings:
             yield f"## Training: {training.stage}\n\n![Losses by step]({training.picture})\n"
-            yield from render_table(("", ""), training.rows())
+            yield from render_table(("", ""), training.rows(self.dataset["options"]))
 
     def _scores(self) -> Iterator[str]:
         generation = self.scores["generation"]

@@ -124,6 +124,17 @@ def test_publish_rejects_weights_without_provenance(smoke, evaluation_directory,
         publish(config)
     (tmp_path / "zoo").mkdir()
     first.rename(tmp_path / "zoo/first")  # publish() reads training.json of this folder because MLflow has no run
+    records = tmp_path / "zoo/first/training.json"
+    trainings = json.loads(records.read_text())
+    for change, accepted in (({"num_train": 5000}, True), ({"seed": 1}, False)):
+        records.write_text(json.dumps([run | {"data": run["data"] | change} for run in trainings]))
+        if accepted:
+            publish(config)
+            assert "| training scenes | 5,000 |" in (tmp_path / "second/README.md").read_text()
+        else:
+            with pytest.raises(ValueError, match=r"the Layout VAE was trained on .*'seed': 1"):
+                publish(config)
+    records.write_text(json.dumps(trainings))
     publish(config)
     cards = [tmp_path / place / "README.md" for place in ("zoo/first", "second")]
     assert cards[0].read_text() == cards[1].read_text()

@@ -173,8 +173,12 @@ def test_train_lvae_with_two_workers_matches_one(home):
     from jobs.implementation.train_lvae import train
     from jobs.train_lvae import Config
 
-    output = train(Config(preset="smoke", name="lvae-two", num_workers=2))
+    output = train(Config(preset="smoke", name="lvae-two", num_workers=2, round_weights=True))
     one, two = load_weights(home / "models/lvae-smoke"), load_weights(Path(output))
+    assert [{str(value.dtype) for value in part.values()} for part in (one, two)] == [
+        {"torch.float32"},
+        {"torch.float16"},
+    ]
     distance = max(np.abs(one[name] - two[name]).max() for name in one)
     assert distance < 1e-2, distance
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import random_scene, small_spec
+from safetensors.torch import load_file
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 from torch import nn
@@ -647,3 +648,20 @@ def test_dit_unpatchify_inverts_patchify():
     tokens = torch.nn.functional.unfold(latent, 2, stride=2)  # (1, c p p, n)
     normal = torch.nn.functional.layer_norm(tokens.transpose(1, 2), (12,), eps=1e-6).transpose(1, 2)
     assert torch.allclose(out, torch.nn.functional.fold(normal, (8, 8), 2, stride=2), atol=1e-5)
+
+
+def test_rounded_weights_need_half_the_space(tmp_path):
+    plain, rounded = make_small_lvae(), make_small_lvae()
+    rounded.round_to_float16()
+    for name, model in (("plain", plain), ("rounded", rounded)):
+        model.save_pretrained(tmp_path / name)
+    files = [tmp_path / name / "diffusion_pytorch_model.safetensors" for name in ("plain", "rounded")]
+    types = [{part.dtype for part in load_file(file).values()} for file in files]
+    assert types == [{torch.float32}, {torch.float16}]
+    loaded = LayoutVAE.from_pretrained(tmp_path / "rounded").state_dict()
+    for name, value in rounded.state_dict().items():
+        assert value.dtype == torch.float32 and torch.equal(loaded[name], value)
+        assert torch.allclose(value, plain.state_dict()[name], rtol=1e-3, atol=1e-6)
+    next(rounded.parameters()).data.flatten()[0] = 1e5
+    with pytest.raises(ValueError, match=r"contains a weight of 100000; float16 ends at 65504"):
+        rounded.round_to_float16()
