@@ -81,9 +81,8 @@ def main(config: Config) -> None:
         models = {}
         for way, decoder in (("as it is", row.model.objects.decoder), ("ours", "detr"), ("plain", "detr")):
             torch.manual_seed(0)
-            model = LayoutVAE(
-                layout=spec.to_dict(), **override_options(row.architecture(), {"objects": {"decoder": decoder}})
-            )
+            changes = {"objects": {"decoder": decoder}, "local_frame": False}  # DETR has no local frame.
+            model = LayoutVAE(layout=spec.to_dict(), **override_options(row.architecture(), changes))
             model.init_from_data(batch)
             models[way] = (model, torch.optim.AdamW(model.parameters(), 1e-5))
         noise = torch.randn(batch_size, *models["ours"][0].latent_shape)

@@ -364,9 +364,8 @@ class ConfiguredModel(nn.Module):
         path.mkdir(parents=True, exist_ok=True)
         write_config(type(self).__name__, self.config, path / CONFIG_NAME)
         state = {name: value.detach().contiguous() for name, value in self.state_dict().items()}
-        halves = {name: value.half() for name, value in state.items()}
-        if all(torch.equal(halves[name].to(value.dtype), value) for name, value in state.items()):
-            state = halves
+        if all(torch.equal(value.half().to(value.dtype), value) for value in state.values()):
+            state = {name: value.half() for name, value in state.items()}
         save_file(state, path / WEIGHTS_NAME, metadata={"format": "pt"})
 
     @torch.no_grad()

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, cast
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from models.base import ConfiguredModel, register_to_config
@@ -65,7 +65,8 @@ class LayoutVAE(ConfiguredModel):
         local_frame: See `LayoutVAEConfig`. It needs both branches, the cell decoder and a ground class "road".
 
     Raises:
-        ValueError: An option is unknown, or the grid does not divide into latent cells.
+        ValueError: An option is unknown, the grid does not divide into latent cells, or the model cannot have a local
+            frame.
     """
 
     @register_to_config
@@ -169,7 +170,8 @@ class LayoutVAE(ConfiguredModel):
         if not (self.object_encoder and self.object_decoder):
             return
         self.object_encoder.grid[channels:] = INITIAL_LOGVAR
-        groups = list(zip(batch.features.split(self.spec.slots, 1), batch.real.split(self.spec.slots, 1), strict=True))
+        local = self.convert_to_local(batch.features, batch.real, self.measure_local_field(batch))
+        groups = list(zip(local.split(self.spec.slots, 1), batch.real.split(self.spec.slots, 1), strict=True))
         features = torch.stack([f[r].mean(dim=0) if r.any() else f.new_full((FEATURES,), 0.5) for f, r in groups])
         count = torch.stack([r.sum() / len(r) for _, r in groups])
         self.object_decoder.init_from_data(compute_clamped_logit(features), count)
@@ -220,11 +222,29 @@ class LayoutVAE(ConfiguredModel):
         """Layout of the scenes."""
         return LayoutSpec.from_dict(self.config.layout)
 
-    def encode(self, batch: LayoutBatch) -> Posterior:
+    def convert_to_local(
+        self, features: Float[Tensor, "batch n 9"], real: Bool[Tensor, "batch n"], local_field: Tensor | None
+    ) -> Float[Tensor, "batch n 9"]:
+        """Convert the features of primitives from the scene frame to the local frame, if the model has one.
+
+        Args:
+            features: Normalised features.
+            real: True for each slot that holds a primitive; the features of other slots do not change.
+            local_field: Output of `measure_local_field`.
+
+        Returns:
+            Features that the object encoder reads.
+        """
+        if self.local_frame is None or local_field is None:
+            return features
+        return torch.where(real[..., None], self.local_frame.to_local(features, local_field), features)
+
+    def encode(self, batch: LayoutBatch, local_field: Tensor | None = None) -> Posterior:
         """Encode layouts to the joint posterior.
 
         Args:
             batch: Layouts.
+            local_field: Output of `measure_local_field` for this batch; None: it is computed.
 
         Returns:
             Posterior; its channels are the ground channels, then the object channels.
@@ -235,9 +255,8 @@ class LayoutVAE(ConfiguredModel):
             maps = torch.cat([batch.height, batch.occupied], dim=1)
             moments.append(self.ground_encoder(maps, distance).chunk(2, 1))
         if self.object_encoder:
-            features, field = batch.features, self.measure_local_field(batch)
-            if self.local_frame and field is not None:
-                features = torch.where(batch.real[..., None], self.local_frame.to_local(features, field), features)
+            field = self.measure_local_field(batch) if local_field is None else local_field
+            features = self.convert_to_local(batch.features, batch.real, field)
             moments.append(self.object_encoder(features, batch.real).chunk(2, 1))
         mean, logvar = (torch.cat(part, dim=1) for part in zip(*moments, strict=True))
         return Posterior(mean, logvar.clamp(-30, 20))
@@ -261,8 +280,8 @@ class LayoutVAE(ConfiguredModel):
             real: (batch, N); True for each slot that holds a primitive.
             raster_px: Number of rows and of columns of the rasters; None: that of the LayoutSpec. Only level sets have
                 another resolution.
-            local_field: Field of the local frame (`measure_local_field`); None: that of the decoded ground. Training
-                uses the field of the true ground, so errors of the ground do not become errors of the objects.
+            local_field: Field of the local frame (`measure_local_field`); None: the field of the decoded ground.
+                Training uses the field of the true ground, so errors of the ground do not become errors of objects.
 
         Returns:
             Output of both decoders.
@@ -359,8 +378,8 @@ class LayoutVAE(ConfiguredModel):
         Args:
             latent: Channels that the ground decoder reads.
             height: Decoded heights.
-            occupancy_logit: Decoded occupancy. If it has not the resolution of the LayoutSpec, the ground is decoded
-                again, so objects do not depend on the resolution of the rasters.
+            occupancy_logit: Decoded occupancy. If its resolution differs from that of the LayoutSpec, the ground is
+                decoded again, so objects do not depend on the resolution of the rasters.
 
         Returns:
             Field for `decode_objects`; None without a local frame.
@@ -388,13 +407,18 @@ class LayoutVAE(ConfiguredModel):
 
         Returns:
             Predicted primitives. If the model has no object branch, there are none.
+
+        Raises:
+            ValueError: The model has a local frame, and `local_field` is None.
         """
         if isinstance(self.object_decoder, DETRDecoder):
             return self.object_decoder(latent, noised, real)
         if self.object_decoder:
             found = self.object_decoder(latent)
-            if self.local_frame is None or local_field is None:
+            if self.local_frame is None:
                 return found
+            if local_field is None:
+                raise ValueError("decode_objects: a model with a local frame needs local_field (compute_local_field)")
             return found._replace(features=self.local_frame.to_scene(found.features, local_field))
         features = latent.new_zeros(len(latent), 0, FEATURES)
         return Proposals(features, features[..., 0])
@@ -423,7 +447,8 @@ class LayoutVAE(ConfiguredModel):
         Returns:
             Output of the decoders, and the posterior.
         """
-        posterior = self.encode(batch)
+        field = self.measure_local_field(batch)
+        posterior = self.encode(batch, field)
         latent = posterior.sample(noise)
         if corruption is not None:
             latent = latent + corruption * posterior.mean.std(dim=(2, 3), keepdim=True)
@@ -432,4 +457,4 @@ class LayoutVAE(ConfiguredModel):
             center, cholesky = DENOISING_NOISE
             scale = self.spec.feature_unit(center)[:3] + self.spec.feature_unit(cholesky**2)[3:]
             noised = (batch.features[:, None] + query_noise * query_noise.new_tensor(scale)).clamp(0, 1)
-        return self.decode(latent, noised, batch.real, local_field=self.measure_local_field(batch)), posterior
+        return self.decode(latent, noised, batch.real, local_field=field), posterior

@@ -764,7 +764,8 @@ class PrITTIPipeline:
                 (models/composition/inpaint.py).
             labels: Label of each scene.
             contents: "objects": regenerate objects on the known ground. "ground": regenerate the ground under the known
-                objects. "both": regenerate ground and objects.
+                objects. "both": regenerate ground and objects. With a local frame, object latents hold no absolute yaw
+                and height, so "ground" knows only the places and shapes of the objects.
             seed: Seed of the run.
             indices: Key of each scene; the noise depends on it (default: 0, 1, ...).
             repaint: Options of RePaint; None: the options of the paper.

@@ -43,6 +43,10 @@ def check_train_lvae(config: LVAEConfig) -> None:
     require_positive(config, "gradient_accumulation_steps")
     if config.start_from and config.train_object_decoder_of:
         raise ValueError("--start-from and --train-object-decoder-of exclude each other: give one of them")
+    if config.round_weights and config.train_object_decoder_of:
+        raise ValueError(
+            "--round-weights would change the encoders that --train-object-decoder-of keeps; leave out one of them"
+        )
     if config.start_from:
         find_start(config.start_from)
     if not needs_smoke_inputs(config):

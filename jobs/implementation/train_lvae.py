@@ -55,7 +55,8 @@ OF_OBJECT_DECODER = (
     "auxiliary_losses",
     "denoising_groups",
 )
-OF_LOSSES = ("loss_unit", "auxiliary_losses")  # Options that change no weights.
+# Options that change no weights. With another frame, the encoder and the decoder only see other yaws and heights.
+MAY_CHANGE = ("loss_unit", "auxiliary_losses", "local_frame")
 START_SCENES, START_SHARDS = 96, 16  # numbers of training scenes and shards from which the model is initialised
 
 
@@ -228,7 +229,7 @@ def load_start(model: str, architecture: dict, spec: LayoutSpec) -> LayoutVAE:
     directory, is_lvae = find_start(model)
     lvae = load_lvae(directory) if is_lvae else load_pipeline(directory).lvae
     for (key, built), (_, wanted) in zip(list_options(lvae.config), list_options(architecture), strict=True):
-        if built != wanted and key not in OF_LOSSES:
+        if built != wanted and key not in MAY_CHANGE:
             raise ValueError(
                 f"--start-from {model}: its {key} is {built}, but that of this preset is {wanted}; use the preset with"
                 " which it was trained"

@@ -32,6 +32,7 @@ from jobs.support.model_files import publish_directory
 from jobs.support.progress import JobProgress
 from jobs.support.ray_session import run_packed, start_ray
 from jobs.support.tracking import Tracker
+from models.base import ConfiguredModel
 from models.training import NonFiniteLossError, OptimizerConfig, Trainer
 from pipelines.runtime import storage
 from pipelines.runtime.resources import count_gpus_per_model, count_room, find_device, require_room
@@ -232,15 +233,21 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
             run.tracker.metrics(values, trainer.steps_done)
         for name, image in pictures.items():
             run.tracker.picture(image, f"{name}/step-{trainer.steps_done:07d}.png")
-    model = trainer.ema_model()
-    if run.round_weights:
-        model = copy.deepcopy(model)  # Without moving average, this is the model that is trained.
-        model.round_to_float16()
+    model = make_result(trainer, run.round_weights)
     tag_weights(run.tracker, model, trainer.steps_done)
     with tempfile.TemporaryDirectory() as directory:
         trainer.save(directory)
         model.save_pretrained(os.path.join(directory, "model"))
         ray.train.report(metrics, checkpoint=Checkpoint.from_directory(directory))
+
+
+def make_result(trainer: Trainer, round_weights: bool) -> ConfiguredModel:
+    """Return the model that a run saves: with EMA weights if EMA is enabled, and rounded on request."""
+    model = trainer.ema_model()
+    if round_weights:
+        model = copy.deepcopy(model)  # Without moving average, this is the model that is trained.
+        model.round_to_float16()
+    return model
 
 
 def tag_weights(tracker: Tracker, model: torch.nn.Module, steps: int) -> None:

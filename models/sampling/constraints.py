@@ -253,7 +253,8 @@ class ConstraintGuidance:
 
 
 class _Start(NamedTuple):
-    """Decoded estimate before the gradient steps: ground, scene and proposal of each object, its existence."""
+    """Decoded estimate before the gradient steps: ground, scene and proposal of each object, its existence, and the
+    field of the local frame (None without one)."""
 
     ground: Ground
     chosen: tuple[Tensor, Tensor]

@@ -8,9 +8,14 @@ or to put them on the ground. The paper encodes both in the scene frame.
 The direction of the streets at a point is the mean direction of the edges of the road, with weights that fall with the
 distance. It is a line, so opposite directions are equal; Cholesky parameters do not distinguish them either. The height
 of the ground is a mean with the same weights.
+
+Where two perpendicular streets are equally near, the direction is not continuous. An object at such a place may be
+decoded with another yaw if the decoded ground differs slightly from the true ground.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -20,8 +25,8 @@ from torch import Tensor
 from models.layout import FEATURES, LayoutSpec
 from models.scene import ROAD_CLASSES, Grid
 
-FINE_PIXEL_M, COARSE_PIXEL_M = 0.5, 1.0  # Pixels of the slopes, and of the fields.
-BLUR_M = 1.5  # Width of the box filter that smooths the road; it is applied twice.
+FINE_PIXEL_M, COARSE_PIXEL_M = 0.5, 1.0  # Pixels of the slopes and of the fields; rasters may be coarser.
+BLUR_M = 2.5  # Width of the box filter that smooths the road; it is applied twice. It is at least three pixels.
 NEAR_M = 1.0  # Weights do not increase further below this distance.
 
 
@@ -36,20 +41,36 @@ def compute_edge_directions(road: Bool[Tensor, "b rows cols"], resolution_m: flo
         Cosine and sine of twice the yaw of the edge, times the squared slope of the smoothed road, in pixels of
         COARSE_PIXEL_M.
     """
-    factor = max(1, round(FINE_PIXEL_M / resolution_m))
-    share, pixel_m = F.avg_pool2d(road.float()[:, None], factor), factor * resolution_m
-    reach = max(1, round(BLUR_M / pixel_m / 2))
+    factor = find_pooling_factor(road.shape[1:], FINE_PIXEL_M / resolution_m)
+    smooth, pixel_m = F.avg_pool2d(road.float()[:, None], factor), factor * resolution_m
+    reach = max(1, round((BLUR_M / pixel_m - 1) / 2))
     for _ in range(2):
-        share = F.avg_pool2d(share, 2 * reach + 1, 1, reach, count_include_pad=False)
-    dx, dy = (torch.zeros_like(share[:, 0]) for _ in range(2))
-    dx[:, 1:-1] = share[:, 0, :-2] - share[:, 0, 2:]
-    dy[:, :, 1:-1] = share[:, 0, :, :-2] - share[:, 0, :, 2:]
+        smooth = F.avg_pool2d(smooth, 2 * reach + 1, 1, reach, count_include_pad=False)
+    dx = smooth[:, 0, :-2, 1:-1] - smooth[:, 0, 2:, 1:-1]
+    dy = smooth[:, 0, 1:-1, :-2] - smooth[:, 0, 1:-1, 2:]
     # The edge is perpendicular to the slope, so twice its yaw has the opposite cosine and sine.
     edges = torch.stack([dy * dy - dx * dx, -2 * dx * dy], dim=1)
-    return F.avg_pool2d(edges, max(1, round(COARSE_PIXEL_M / pixel_m)))
+    # Near the border, the filter sees only one side, so slopes are wrong.
+    margin = min(2 * reach, edges.shape[2] // 4, edges.shape[3] // 4)
+    edges = edges[:, :, margin : edges.shape[2] - margin, margin : edges.shape[3] - margin]
+    edges = F.pad(edges, (margin + 1,) * 4)
+    return F.avg_pool2d(edges, find_pooling_factor(edges.shape[2:], COARSE_PIXEL_M / pixel_m))
 
 
-def spread(values: Float[Tensor, "b k rows cols"], pixel_m: float) -> Float[Tensor, "b k rows cols"]:
+def find_pooling_factor(shape: Sequence[int], ratio: float) -> int:
+    """Return the largest whole number up to a ratio that divides both sides of a raster.
+
+    Args:
+        shape: Numbers of rows and columns.
+        ratio: Wanted factor.
+
+    Returns:
+        Factor, at least 1.
+    """
+    return max(k for k in range(1, max(1, round(ratio)) + 1) if not any(side % k for side in shape))
+
+
+def sum_weighted(values: Float[Tensor, "b k rows cols"], pixel_m: float) -> Float[Tensor, "b k rows cols"]:
     """Sum values over all pixels, with the weights 1 / (d^2 + NEAR_M^2)^2 at the distance d.
 
     Args:
@@ -143,13 +164,15 @@ class LocalFrame:
         """
         with torch.no_grad(), torch.autocast(height.device.type, enabled=False):
             grid, rows = self.spec.grid, occupied.shape[2]
+            if not len(occupied):
+                return height.new_full((0, 3, 1, 1), 0.5, dtype=torch.float64)
             resolution_m = grid.rows * grid.resolution_m / rows
             edges = compute_edge_directions(occupied[:, self.road].any(dim=1), resolution_m)
             factor = rows // edges.shape[2]
             mask = occupied.float()
             ground = torch.stack([(mask * height.float()).sum(dim=1), mask.sum(dim=1)], dim=1)
             values = torch.cat([edges, F.avg_pool2d(ground, factor)], dim=1)
-            cos, sin, total, weight = spread(values, factor * resolution_m).unbind(1)
+            cos, sin, total, weight = sum_weighted(values, factor * resolution_m).unbind(1)
             found = torch.where(weight > 1e-9, total / weight, 0.5)
             return torch.stack([cos, sin, found], dim=1)
 

@@ -278,17 +278,24 @@ class Variant:
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
+# A local frame needs both branches and the cell decoder, so no variant of these studies has one.
+SCENE_FRAME: dict[str, object] = {"local_frame": False}
 BRANCH_VARIANTS = {
-    "full model": Variant(),
-    "without latent split": Variant({"split_latent": False}),
-    "without objects": Variant({"branches": "ground"}),
-    "without ground": Variant({"branches": "objects"}),
+    name: Variant(SCENE_FRAME | changes)
+    for name, changes in {
+        "full model": {},
+        "without latent split": {"split_latent": False},
+        "without objects": {"branches": "ground"},
+        "without ground": {"branches": "objects"},
+    }.items()
 }
 # Both decoders have the same ground branch, latents and unit of the losses (cells).
 DECODER_VARIANTS = {
-    "cells": Variant({"objects": {"decoder": "cells"}}),
-    "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
-    "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
+    "cells": Variant(SCENE_FRAME | {"objects": {"decoder": "cells"}}),
+    "DETR": Variant(SCENE_FRAME | {"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
+    "DETR, no shortcuts": Variant(
+        SCENE_FRAME | {"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}
+    ),
 }
 COMBINED: dict[str, object] = {
     "loss_unit": "metres",
@@ -322,14 +329,14 @@ _DETR_CHANGES = {
     "combined, learned contents": Variant({"objects": COMBINED | {"learned_content": True}}),
 }
 DETR_VARIANTS = {
-    name: Variant({"branches": "objects"} | dict(change.architecture), change.options)
+    name: Variant(SCENE_FRAME | {"branches": "objects"} | dict(change.architecture), change.options)
     for name, change in _DETR_CHANGES.items()
 }
 # Variants with only the ground branch. The preset `town-pixels` has `pixel_unshuffle=8` and `channels=(32,)`.
 # With the option `shortcut`, the initial weights are a linear map from a principal component analysis of the data
 # (models/vae/ground.py).
 GROUND_VARIANTS = {
-    name: Variant({"branches": "ground"} | changes)
+    name: Variant(SCENE_FRAME | {"branches": "ground"} | changes)
     for name, changes in {
         "as the preset": {},
         "without the linear start": {"shortcut": False},

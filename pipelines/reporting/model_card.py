@@ -68,8 +68,9 @@ class TrainingRecord:
         if self.parameters is not None:
             yield "parameters", f"{self.parameters:,}"
         yield "training steps", f"{self.steps:,}"
-        if self.data and self.data.get("num_train") != data.get("num_train"):
-            yield "training scenes", f"{self.data['num_train']:,}"
+        scenes = self.data.get("num_train") if self.data else None
+        if scenes is not None and scenes != data.get("num_train"):
+            yield "training scenes", f"{scenes:,}"
         yield "training time, h", f"{self.hours:.1f}"
         yield from self.origin.items()
         yield "options", ", ".join(f"{key} {value}" for key, value in self.options.items() if key not in HIDDEN)
@@ -134,7 +135,8 @@ class ModelCard:
         scenes = ", ".join(f"{count:,} {split}" for split, count in sorted(self.dataset["scenes"].items()))
         yield (
             f"## Data\n\nThe dataset is {self.dataset['source']} ({scenes} scenes). The model is trained on the train "
-            f"split and compared with the {self.real_split} split. Options of `jobs/preprocess_scenes.py`:\n"
+            f"split, unless a run states another number of training scenes, and compared with the {self.real_split} "
+            f"split. Options of `jobs/preprocess_scenes.py`:\n"
         )
         yield f"```json\n{json.dumps({k: v for k, v in self.dataset['options'].items() if k != 'input'})}\n```\n"
         for training in self.trainings:

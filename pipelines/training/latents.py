@@ -20,8 +20,11 @@ from pipelines.schema.tables import Shard, find_shards, make_latents_schema
 
 
 def digest_weights(model: torch.nn.Module) -> str:
-    """Return the first twelve hexadecimal digits of a hash of the weights of a model."""
-    digest = hashlib.sha256()
+    """Return the first twelve hexadecimal digits of a hash of the weights of a model.
+
+    The digest also tells whether a layout VAE has a local frame, which changes latents but no weights.
+    """
+    digest = hashlib.sha256(b"local_frame" if getattr(model, "local_frame", None) else b"")
     for name, value in sorted(model.state_dict().items()):
         digest.update(name.encode())
         digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())

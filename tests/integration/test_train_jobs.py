@@ -14,7 +14,9 @@ import torch
 from helpers import run_command, small_spec
 from safetensors.torch import load_file
 
+from models.dit import DiT
 from models.presets import LVAE_PRESETS
+from models.training import OptimizerConfig, make_dit_trainer
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import find_shards
 
@@ -169,6 +171,21 @@ def test_train_dit_with_three_workers_matches_one_and_resumes(home, tmp_path, mo
         train(Config(preset="smoke", name="dit-odd", num_workers=2, batch_size=1))
 
 
+@pytest.mark.parametrize("ema_decay", [None, 0.9])
+def test_rounding_of_result_does_not_change_training(ema_decay):
+    from jobs.support.trainer import make_result
+
+    settings = OptimizerConfig(8, 1e-3, ema_decay=ema_decay)
+    trainer = make_dit_trainer(DiT(channels=4, size=8, width=32, depth=1, heads=2), settings, 0.1, torch.device("cpu"))
+    before = {name: value.clone() for name, value in trainer.model.state_dict().items()}
+    result = make_result(trainer, round_weights=True).state_dict()
+    assert all(torch.equal(value, before[name]) for name, value in trainer.model.state_dict().items())
+    assert all(torch.equal(value, before[name].half().float()) for name, value in result.items())
+    assert not all(torch.equal(value, before[name]) for name, value in result.items())
+    plain = make_result(trainer, round_weights=False).state_dict()
+    assert all(torch.equal(value, before[name]) for name, value in plain.items())
+
+
 def test_train_lvae_with_two_workers_matches_one(home):
     from jobs.implementation.train_lvae import train
     from jobs.train_lvae import Config
@@ -227,6 +244,8 @@ def test_train_lvae_starts_from_trained_weights(home):
         check_train_lvae(Config(preset="smoke", start_from="/nowhere"))
     with pytest.raises(ValueError, match=r"--start-from .*its latent_channels is 4, but that of this preset is 16"):
         prepare(Config(preset="demo", name="other", dataset=dataset, start_from=str(model)))
+    with pytest.raises(ValueError, match="--round-weights would change the encoders"):
+        check_train_lvae(Config(preset="smoke", round_weights=True, train_object_decoder_of="town"))
     with pytest.raises(ValueError, match="exclude each other"):
         prepare(Config(preset="smoke", name="both", start_from=str(model), train_object_decoder_of=str(model)))
     spec = small_spec()

@@ -294,6 +294,15 @@ def test_ground_study_shrinks_networks_at_equal_latents():
     assert max(sizes, key=sizes.get) == "the paper's networks"
 
 
+def test_variants_can_be_built_from_preset_town():
+    row = LVAE_PRESETS["town"]
+    layout = LayoutSpec().with_resolution(row.raster_px).to_dict()
+    for study in (BRANCH_VARIANTS, DECODER_VARIANTS, DETR_VARIANTS, GROUND_VARIANTS, AUGMENTATION_VARIANTS):
+        for variant in study.values():
+            with torch.device("meta"):
+                LayoutVAE(layout=layout, **override_options(row.architecture(), variant.architecture))
+
+
 def test_variant_names_are_valid_for_files_and_mlflow():
     from jobs.implementation.ablate_lvae import make_slug
 

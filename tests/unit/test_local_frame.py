@@ -8,14 +8,18 @@ import torch
 from helpers import random_scene, small_spec
 from scipy.spatial.transform import Rotation
 
+from models.dit import DiT
 from models.geometry.cholesky import compute_cholesky_parameters
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
+from models.pipeline import PrITTIPipeline
 from models.presets import LVAE_PRESETS
+from models.sampling.penalties import compute_penalties, find_objects, make_ground, make_objects
 from models.scene import Scene, canonicalize_boxes, make_yaw_rotation
 from models.tensors import assign_slots, make_layout_batch
 from models.vae.config import override_options
-from models.vae.local_frame import LocalFrame, rotate_cholesky, sample_field, spread
+from models.vae.local_frame import LocalFrame, find_pooling_factor, rotate_cholesky, sample_field, sum_weighted
+from pipelines.training.latents import digest_weights
 
 SPEC = LayoutSpec().with_resolution(256)
 MIDDLE_M = 32.0
@@ -66,12 +70,12 @@ def test_rotated_cholesky_parameters_equal_numpy():
     assert np.allclose(rotate_cholesky(parameters, torch.from_numpy(yaw_rad)).numpy(), expected, atol=1e-9)
 
 
-def test_spread_equals_direct_sum():
+def test_weighted_sum_equals_direct_sum():
     values = np.random.default_rng(0).normal(size=(1, 2, 7, 9))
     row, col = np.indices((7, 9)) * 0.5
     squared = (row[..., None, None] - row) ** 2 + (col[..., None, None] - col) ** 2
     expected = np.einsum("ijkl,bckl->bcij", 1 / (squared + 1) ** 2, values)
-    assert np.allclose(spread(torch.from_numpy(values), 0.5).numpy(), expected)
+    assert np.allclose(sum_weighted(torch.from_numpy(values), 0.5).numpy(), expected)
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.3, 0.8, 1.5, 2.4, -0.7])
@@ -82,6 +86,9 @@ def test_field_has_direction_and_height_of_street(yaw_rad):
     cos, sin, height = sample_field(field, torch.from_numpy(scene.center_m[None, :, :2]), SPEC.grid)[0]
     found = 0.5 * torch.atan2(sin, cos).numpy()
     deviation = (found - yaw_rad + np.pi / 2) % np.pi - np.pi / 2
+    assert np.abs(deviation).max() < np.deg2rad(3)
+    over_all = 0.5 * torch.atan2(field[0, 1], field[0, 0]).numpy()  # Including the border of the scene.
+    deviation = (over_all - yaw_rad + np.pi / 2) % np.pi - np.pi / 2
     assert np.abs(deviation).max() < np.deg2rad(3)
     low, high = SPEC.height_bounds_m.low[0], SPEC.height_bounds_m.high[0]
     assert np.allclose(height.numpy() * (high - low) + low, 1.5, atol=1e-3)
@@ -137,6 +144,72 @@ def test_object_latents_do_not_depend_on_height_of_scene():
         low, high = (model.encode(batch).mean for batch in batches)
         assert torch.allclose(low[:, 8:], high[:, 8:], atol=1e-4) == same
         assert not torch.allclose(low[:, :8], high[:, :8], atol=1e-2)
+
+
+def test_object_latents_of_turned_street_are_equal():
+    """Only x and y, but not yaw, differ between a street along x and the same street along y."""
+    lvae = make_lvae(objects={"decoder": "cells"})
+    frame = LocalFrame(SPEC)
+    boxes = []
+    for yaw_rad in (0.0, np.pi / 2):
+        batch = make_layout_batch([make_street(yaw_rad)], SPEC)
+        field = frame.compute_field(batch.height, batch.occupied > 0.5)
+        boxes.append(frame.to_local(batch.features, field)[batch.real])
+    assert torch.allclose(*(torch.sort(part[:, 3:], dim=0).values for part in boxes), atol=5e-3)
+    batch = make_layout_batch([random_scene(0)], small_spec())
+    with torch.autocast("cpu", torch.bfloat16):
+        latent = lvae.encode(batch).mean
+        output = lvae.decode(latent)
+    exact = lvae.decode(lvae.encode(batch).mean)
+    assert output.features.dtype == torch.float32
+    assert ((output.features - exact.features).abs() < 0.1).float().mean() > 0.9  # Random ground has no clear streets.
+
+
+def test_start_from_data_uses_local_features():
+    lvae, batch = make_lvae(), make_layout_batch([random_scene(i, n=60) for i in range(8)], small_spec())
+    lvae.init_from_data(batch)
+    local = lvae.convert_to_local(batch.features, batch.real, lvae.measure_local_field(batch))
+    slots = slice(0, small_spec().slots[0])  # Slots of the first category.
+    expected = local[:, slots][batch.real[:, slots]].mean(dim=0)
+    decoder = lvae.object_decoder
+    assert decoder is not None
+    bias = decoder.head.bias.reshape(-1, 10)[0]
+    assert torch.allclose(bias[3:].sigmoid(), expected[2:].clamp(0.01, 0.99), atol=1e-5)
+    assert not torch.allclose(expected, batch.features[:, slots][batch.real[:, slots]].mean(dim=0), atol=1e-3)
+
+
+def test_empty_batch_and_odd_rasters():
+    frame = LocalFrame(SPEC)
+    field = frame.compute_field(torch.zeros(0, 5, 256, 256), torch.zeros(0, 5, 256, 256, dtype=torch.bool))
+    assert frame.to_scene(torch.zeros(0, 4, 9), field).shape == (0, 4, 9)
+    assert [find_pooling_factor((250, 250), ratio) for ratio in (2.0, 4.0, 0.3)] == [2, 2, 1]
+
+
+def test_constraints_measure_objects_in_scene_frame():
+    lvae = make_lvae()
+    channels, size, _ = lvae.latent_shape
+    dit = DiT(channels=channels, size=size, width=32, depth=1, heads=2, layout=small_spec().to_dict())
+    pipeline = PrITTIPipeline(lvae, dit)
+    pipeline.use_constraints(True)
+    guidance = pipeline.guidance
+    assert guidance is not None
+    latent = 2 * torch.randn(2, *lvae.latent_shape, generator=torch.Generator().manual_seed(0))
+    output = lvae.decode(latent)
+    chosen = find_objects(output.features, output.existence_logit, output.proposals, lvae.spec, True)
+    objects = make_objects(output.features, output.existence_logit, output.proposals, lvae.spec, chosen)
+    expected = compute_penalties(objects, make_ground(output, lvae.spec), guidance.names)
+    measured = guidance.measure_penalties(latent)
+    assert measured.keys() == expected.keys() and sum(float(value.sum()) for value in expected.values()) > 0
+    for name, value in expected.items():
+        assert torch.allclose(measured[name], value, rtol=1e-4), name
+    with pytest.raises(ValueError, match="a model with a local frame needs local_field"):
+        lvae.decode_objects(lvae.split(latent)[1])
+
+
+def test_local_frame_changes_digest_of_weights():
+    one, other = make_lvae(), make_lvae(local_frame=False)
+    other.load_state_dict(one.state_dict())
+    assert digest_weights(one) != digest_weights(other)
 
 
 def test_decoded_objects_do_not_depend_on_resolution():
