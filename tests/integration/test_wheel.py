@@ -51,7 +51,7 @@ def test_wheel_holds_weights_web_files_and_type_markers(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     assert {f"{package}/py.typed" for package in PACKAGES} <= names
-    data = {path for folder in ("models/weights", "pipelines/web") for path in (ROOT / folder).rglob("*")}
+    data = {path for folder in ("models/weights/town", "pipelines/web") for path in (ROOT / folder).rglob("*")}
     modules = {path for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
     assert {path.relative_to(ROOT).as_posix() for path in data | modules if path.is_file()} <= names
     assert not [name for name in names if name.startswith(("tests", "docs", "benchmarks", "infra"))]
