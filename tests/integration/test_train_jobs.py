@@ -175,7 +175,7 @@ def test_train_dit_with_three_workers_matches_one_and_resumes(home, tmp_path, mo
 def test_rounding_of_result_does_not_change_training(ema_decay):
     from jobs.support.trainer import make_result
 
-    settings = OptimizerConfig(8, 1e-3, ema_decay=ema_decay)
+    settings = OptimizerConfig(8, 1e-3, 0.0, ema_decay=ema_decay)
     trainer = make_dit_trainer(DiT(channels=4, size=8, width=32, depth=1, heads=2), settings, 0.1, torch.device("cpu"))
     before = {name: value.clone() for name, value in trainer.model.state_dict().items()}
     result = make_result(trainer, round_weights=True).state_dict()
