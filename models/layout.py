@@ -131,6 +131,12 @@ class LayoutSpec:
         """(N,) category of each slot, as an index into `categories`."""
         return np.repeat(np.arange(len(self.slots)), self.slots)
 
+    @property
+    def feature_bounds(self) -> Bounds:
+        """Bounds of the nine features: centre, then Cholesky parameters."""
+        center, cholesky = self.center_bounds_m, self.cholesky_bounds
+        return Bounds((*center.low, *cholesky.low), (*center.high, *cholesky.high))
+
     def with_resolution(self, pixels: int) -> LayoutSpec:
         """Return a copy of this spec whose square pixel grid has a different resolution over the same area.
 
@@ -155,11 +161,8 @@ class LayoutSpec:
             The length in the normalised unit of each feature: nine numbers (3 centre coordinates, 6 Cholesky
             parameters).
         """
-        return tuple(
-            unit / (high - low)
-            for bounds, unit in ((self.center_bounds_m, length_m), (self.cholesky_bounds, length_m**0.5))
-            for low, high in zip(bounds.low, bounds.high, strict=True)
-        )
+        bounds, units = self.feature_bounds, (length_m,) * 3 + (length_m**0.5,) * 6
+        return tuple(unit / (high - low) for low, high, unit in zip(bounds.low, bounds.high, units, strict=True))
 
     def to_dict(self) -> dict:
         """Return the spec as a dictionary that JSON can store."""

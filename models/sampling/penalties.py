@@ -34,6 +34,7 @@ from models.scene import (
     VEGETATION,
     VEHICLES,
 )
+from models.vae.local_frame import locate_in_raster
 from models.vae.outputs import LayoutOutput
 
 MIN_EXISTENCE = 0.2  # Proposals with a lower existence probability have no penalty.
@@ -226,10 +227,7 @@ class Ground:
         Returns:
             (n, k, p) values; outside the grid, the value of the nearest pixel.
         """
-        grid = self.spec.grid
-        row = 2 * (grid.front_m - xy_m[..., 0]) / (grid.front_m - grid.back_m) - 1
-        col = 2 * (grid.left_m - xy_m[..., 1]) / (grid.left_m - grid.right_m) - 1
-        place = torch.stack([col, row], dim=-1)  # (n, p, 2), in the order of grid_sample.
+        place = locate_in_raster(xy_m, self.spec.grid)  # (n, p, 2)
         parts = [
             (index := torch.nonzero(scene == one)[:, 0], F.grid_sample(
                 maps[one : one + 1], place[index][None], "bilinear", "border", align_corners=False
@@ -403,10 +401,7 @@ def make_objects(
     """
     scene, slot = chosen
     values = features[scene, slot].float()
-    low, high = (
-        values.new_tensor([*getattr(spec.center_bounds_m, side), *getattr(spec.cholesky_bounds, side)])
-        for side in ("low", "high")
-    )
+    low, high = values.new_tensor(spec.feature_bounds.low), values.new_tensor(spec.feature_bounds.high)
     values = values * (high - low) + low
     lower = values.new_zeros(len(values), 3, 3)
     lower[:, TRIL[0], TRIL[1]] = values[:, 3:]

@@ -89,6 +89,21 @@ def sum_weighted(values: Float[Tensor, "b k rows cols"], pixel_m: float) -> Floa
     return torch.fft.irfft2(product, padded)[:, :, rows - 1 : 2 * rows - 1, cols - 1 : 2 * cols - 1]
 
 
+def locate_in_raster(xy_m: Float[Tensor, "*batch 2"], grid: Grid) -> Float[Tensor, "*batch 2"]:
+    """Convert positions to the coordinates of `torch.nn.functional.grid_sample`.
+
+    Args:
+        xy_m: Positions in the scene frame.
+        grid: Area of the raster.
+
+    Returns:
+        Column and row; -1 and 1 are the borders of the raster.
+    """
+    row = 2 * (grid.front_m - xy_m[..., 0]) / (grid.front_m - grid.back_m) - 1
+    col = 2 * (grid.left_m - xy_m[..., 1]) / (grid.left_m - grid.right_m) - 1
+    return torch.stack([col, row], dim=-1)
+
+
 def sample_field(
     field: Float[Tensor, "b k rows cols"], xy_m: Float[Tensor, "b n 2"], grid: Grid
 ) -> Float[Tensor, "b k n"]:
@@ -102,10 +117,7 @@ def sample_field(
     Returns:
         Values at the points.
     """
-    length_m, width_m = grid.rows * grid.resolution_m, grid.cols * grid.resolution_m
-    col = 2 * (grid.left_m - xy_m[..., 1]) / width_m - 1
-    row = 2 * (grid.front_m - xy_m[..., 0]) / length_m - 1
-    place = torch.stack([col, row], dim=-1)[:, None].to(field.dtype)
+    place = locate_in_raster(xy_m, grid)[:, None].to(field.dtype)
     return F.grid_sample(field, place, padding_mode="border", align_corners=False)[:, :, 0]
 
 
@@ -207,13 +219,9 @@ class LocalFrame:
     def _convert(self, features: Tensor, field: Tensor, sign: float) -> Tensor:
         spec = self.spec
         with torch.autocast(features.device.type, enabled=False):
-            low, high = (
-                features.new_tensor(
-                    [*getattr(spec.center_bounds_m, side), *getattr(spec.cholesky_bounds, side)], dtype=torch.float32
-                )
-                for side in ("low", "high")
-            )
-            values = features.float() * (high - low) + low
+            values = features.float()
+            low, high = values.new_tensor(spec.feature_bounds.low), values.new_tensor(spec.feature_bounds.high)
+            values = values * (high - low) + low
             found = sample_field(field, values[..., :2].detach(), spec.grid)
             yaw_rad = (0.5 * torch.atan2(found[:, 1], found[:, 0])).float()
             # Heights are relative to the middle of their bounds, so z keeps its bounds.
