@@ -23,6 +23,7 @@ from jobs.support.options import (
     IfBusyOption,
     LogFormatOption,
     ModelOption,
+    PagScaleOption,
     WaitForResourcesOption,
 )
 
@@ -52,6 +53,7 @@ class Config:
     """Divisor of the predicted noise; values above 1 preserve small objects (default: published value; 1 with ddpm)."""
     existence_threshold: float | None = None
     """Keep primitives with a higher existence probability (default: published value; paper: 0.3)."""
+    pag_scale: PagScaleOption = None
     constraints: ConstraintsOption = None
     repair: bool = False
     """Repair floating, sunken and overlapping objects, as jobs/edit_scenes.py repair --no-drop does."""

@@ -23,6 +23,7 @@ from jobs.support.options import (
     IfBusyOption,
     LogFormatOption,
     ModelOption,
+    PagScaleOption,
     WaitForResourcesOption,
 )
 
@@ -48,6 +49,7 @@ class Config:
     """Random seed."""
     guidance_scale: tuple[float, ...] = (1.0,)
     """Classifier-free guidance scales to compare; 1 switches guidance off."""
+    pag_scale: PagScaleOption = None
     constraints: ConstraintsOption = None
     batch_size: int = 8
     """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding, except in

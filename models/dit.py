@@ -110,13 +110,14 @@ class DiTBlock(nn.Module):
         self.modulation = nn.Linear(width, 6 * width)
 
     def forward(
-        self, x: Float[Tensor, "batch n d"], modulation: Float[Tensor, "batch 6*d"]
+        self, x: Float[Tensor, "batch n d"], modulation: Float[Tensor, "batch 6*d"], perturb: bool = False
     ) -> Float[Tensor, "batch n d"]:
         """Apply the block.
 
         Args:
             x: Tokens.
             modulation: Shifts, scales and gates, which `self.modulation` computes from the condition.
+            perturb: Whether each token attends only to itself, as perturbed-attention guidance needs.
 
         Returns:
             Tokens of the same shape.
@@ -125,7 +126,8 @@ class DiTBlock(nn.Module):
         width = x.shape[-1:]
         y = modulate(F.layer_norm(x, width, eps=1e-6), shift1, scale1)
         q, k, v = self.qkv(y).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)  # q, k, v: (b, heads, n, dh).
-        y = self.out(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+        attended = v if perturb else F.scaled_dot_product_attention(q, k, v)
+        y = self.out(attended.transpose(1, 2).flatten(2))
         x = torch.addcmul(x, gate1[:, None], y)
         y = modulate(F.layer_norm(x, width, eps=1e-6), shift2, scale2)
         return torch.addcmul(x, gate2[:, None], self.mlp_out(F.gelu(self.mlp_in(y), approximate="tanh")))
@@ -337,7 +339,9 @@ class DiT(ConfiguredModel):
         return self.apply_modulations(latent, self.modulations(timestep, label))
 
     @torch.no_grad()
-    def precompute_conditioning(self, timesteps: Sequence[int], labels: Iterable[int]) -> Denoiser:
+    def precompute_conditioning(
+        self, timesteps: Sequence[int], labels: Iterable[int], pag_scale: float = 0.0
+    ) -> Denoiser:
         """Precompute the modulations for timesteps and labels, and return a faster `forward` for them.
 
         The modulation layers hold a third of the weights. Without precomputation, each step reads all weights of these
@@ -346,6 +350,7 @@ class DiT(ConfiguredModel):
         Args:
             timesteps: All timesteps that the denoiser will receive.
             labels: All class indices that the denoiser will receive, including the null label if guidance needs it.
+            pag_scale: Scale of perturbed-attention guidance (`apply_modulations`); 0 switches it off.
 
         Returns:
             A denoiser. The denoiser raises IndexError for other timesteps or labels.
@@ -360,18 +365,23 @@ class DiT(ConfiguredModel):
             row_of[timestep, label] = torch.arange(len(timestep), device=timestep.device) + k * len(timestep)
 
         def denoise(latent: Tensor, timestep: Tensor, label: Tensor) -> Tensor:
-            return self.apply_modulations(latent, table[row_of[timestep, label]].split(sizes, dim=1))
+            return self.apply_modulations(latent, table[row_of[timestep, label]].split(sizes, dim=1), pag_scale)
 
         return denoise
 
     def apply_modulations(
-        self, latent: Float[Tensor, "batch c h w"], modulations: Sequence[Tensor]
+        self, latent: Float[Tensor, "batch c h w"], modulations: Sequence[Tensor], pag_scale: float = 0.0
     ) -> Float[Tensor, "batch c h w"]:
         """Predict the noise in latents with precomputed modulations.
+
+        Perturbed-attention guidance (PAG; Ahn et al., ECCV 2024) moves the prediction away from that of a worse
+        network: the same network, but in its middle block, each token attends only to itself. Both networks share the
+        blocks before this block, so that the guidance costs half an evaluation.
 
         Args:
             latent: Noisy latents.
             modulations: Output of the method `modulations`.
+            pag_scale: Scale of perturbed-attention guidance; 0 switches it off.
 
         Returns:
             Predicted noise.
@@ -379,11 +389,19 @@ class DiT(ConfiguredModel):
         patch, tokens = self.config.patch, self.config.size // self.config.patch
         x = apply_in_float32(self.patch_in, latent).flatten(2).transpose(1, 2) + self.positions  # (b, n, d)
         *of_blocks, of_output, shares = modulations
-        for block, modulation in zip(self.blocks, of_blocks, strict=True):
-            x = block(x, modulation)
+        for number, (block, modulation) in enumerate(zip(self.blocks, of_blocks, strict=True)):
+            if pag_scale and number == len(self.blocks) // 2:
+                x = torch.cat([block(x, modulation), block(x, modulation, perturb=True)])
+            else:
+                x = block(x, modulation if len(modulation) == len(x) else modulation.repeat(2, 1))
+        if pag_scale:
+            of_output = of_output.repeat(2, 1)
         shift, scale = of_output.chunk(2, dim=1)
         x = modulate(F.layer_norm(x, x.shape[-1:], eps=1e-6), shift, scale)
         x = apply_in_float32(self.patch_out, x)  # (b, n, p p c).
+        if pag_scale:
+            x, perturbed = x.chunk(2)
+            x = x + pag_scale * (x - perturbed)
         x = x.unflatten(1, (tokens, tokens)).unflatten(3, (patch, patch, -1))  # (b, i, j, p, q, c).
         x = x.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)
         if self.config.prediction == "epsilon":

@@ -48,6 +48,7 @@ from models.sampling.diffusion import (
     sample,
     sample_with_scheduler,
     scale_noise,
+    switch_at_timestep,
     with_guidance,
 )
 from models.sampling.repaint import NUM_INFERENCE_STEPS, RePaintConfig
@@ -58,6 +59,8 @@ from models.tensors import EXISTENCE_THRESHOLD, make_empty_scene, make_layout_ba
 COMPONENTS = {"lvae": LayoutVAE, "dit": DiT}
 NEIGHBOUR_LATENTS = ("reencode", "copy", "paper")
 SCHEDULER_CONFIG = "scheduler/scheduler_config.json"
+MAX_PAG_SCALE = 20.0
+PAG_INTERVAL = 0.2  # Share of the timesteps, the least noisy ones, without perturbed-attention guidance.
 INDEX_RULES: dict[str, Rule] = {
     **dict.fromkeys((*COMPONENTS, "scheduler"), Sequential(Text(), 2, 2)),
     "noise_scaling": Number(0.9, 1.1),
@@ -65,6 +68,7 @@ INDEX_RULES: dict[str, Rule] = {
     "neighbour_latents": Choice(NEIGHBOUR_LATENTS),
     "constraints": Flag(),
     "attach": Flag(),
+    "pag_scale": Number(0, MAX_PAG_SCALE),
 }
 
 
@@ -134,6 +138,8 @@ class PrITTIPipeline:
         constraints: Whether constraints guide sampling by default (models/sampling/constraints.py). The paper has none.
         attach: Whether decoding attaches signs and poles by default (models/composition/attachments.py). The paper does
             not do this.
+        pag_scale: Default scale of perturbed-attention guidance (`DiT.apply_modulations`) at noisy timesteps; 0
+            switches it off, as in the paper.
 
     Raises:
         ValueError: The LayoutSpec or the shape of the latents of the DiT differs from that of `lvae`, or the noise
@@ -150,6 +156,7 @@ class PrITTIPipeline:
         neighbour_latents: str = "reencode",
         constraints: bool = False,
         attach: bool = True,
+        pag_scale: float = 0.0,
     ) -> None:
         self.lvae, self.dit = lvae.eval().requires_grad_(False), dit.eval().requires_grad_(False)
         self.scheduler = SchedulerConfig.ddpm(dit.diffusion)
@@ -161,6 +168,7 @@ class PrITTIPipeline:
             neighbour_latents=neighbour_latents,
             constraints=constraints,
             attach=attach,
+            pag_scale=pag_scale,
         )
         self.execution = SamplingExecution()
         # What the last denoiser depends on, its labels, and the denoiser.
@@ -173,6 +181,7 @@ class PrITTIPipeline:
         self.attachments = AttachmentReport()
         self.guidance: ConstraintGuidance | None = None
         self.use_constraints(None)
+        self.use_pag(None)
 
     @classmethod
     def from_pretrained(cls, directory: str | os.PathLike, torch_dtype: torch.dtype | None = None) -> PrITTIPipeline:
@@ -207,7 +216,7 @@ class PrITTIPipeline:
         except ValueError as error:
             raise ValueError(f"{path / SCHEDULER_CONFIG}: {error}") from error
         components = {name: kind.from_pretrained(path / name, torch_dtype) for name, kind in COMPONENTS.items()}
-        names = ("noise_scaling", "existence_threshold", "neighbour_latents", "constraints", "attach")
+        names = ("noise_scaling", "existence_threshold", "neighbour_latents", "constraints", "attach", "pag_scale")
         thresholds = {name: index[name] for name in names if name in index}
         try:
             return cls(**components, scheduler=scheduler, **thresholds)
@@ -287,7 +296,7 @@ class PrITTIPipeline:
         self.scheduler_config.require_schedule(self.dit.diffusion)
 
     def register_to_config(self, **changes: Any) -> None:
-        """Replace `noise_scaling`, `existence_threshold`, `neighbour_latents`, `constraints` or `attach`.
+        """Replace entries of `config`, such as `noise_scaling`. `use_constraints` and `use_pag` apply the new defaults.
 
         Args:
             **changes: New values by name.
@@ -358,6 +367,35 @@ class PrITTIPipeline:
             Whether to guide sampling.
         """
         return self.config.constraints if constraints is None else constraints
+
+    def use_pag(self, pag_scale: float | None) -> None:
+        """Set the scale of perturbed-attention guidance for sampling, inpainting and outpainting.
+
+        Args:
+            pag_scale: Scale; 0 switches the guidance off; None: the default of the pipeline.
+
+        Raises:
+            ValueError: The scale is out of range.
+        """
+        self.pag_scale = self.resolve_pag_scale(pag_scale)
+
+    def resolve_pag_scale(self, pag_scale: float | None) -> float:
+        """Return a scale of perturbed-attention guidance, or the default of the pipeline if the argument is None.
+
+        Args:
+            pag_scale: Scale; None: the default.
+
+        Returns:
+            The scale.
+
+        Raises:
+            ValueError: The scale is out of range.
+        """
+        if pag_scale is None:
+            return self.config.pag_scale
+        if not 0 <= pag_scale <= MAX_PAG_SCALE:
+            raise ValueError(f"pag_scale is {pag_scale}, expected 0 to {MAX_PAG_SCALE:g}; 0 switches the guidance off")
+        return pag_scale
 
     @contextmanager
     def _guide(
@@ -520,7 +558,10 @@ class PrITTIPipeline:
     def make_denoiser(
         self, timesteps: np.ndarray | Tensor, label: Int[Tensor, " b"], guidance_scale: float = 1.0
     ) -> Denoiser:
-        """Return the DiT with classifier-free guidance and precomputed modulations, run as `set_execution` says.
+        """Return the DiT with guidance and precomputed modulations, run as `set_execution` says.
+
+        Perturbed-attention guidance applies to the conditional and to the unconditional noise, and only at noisy
+        timesteps (a limited interval; Kynkäänniemi et al., NeurIPS 2024).
 
         The last denoiser is kept for batches with the same timesteps, so they share a CUDA graph. It is made again if a
         batch has a new label, or if weights change; changes through `weight.data` are not noticed.
@@ -536,16 +577,23 @@ class PrITTIPipeline:
         null = self.dit.null_label
         labels = {*label.tolist()} if guidance_scale == 1.0 else {*label.tolist(), null}
         weights = tuple((weight.data_ptr(), _get_version(weight)) for weight in self.dit.parameters())
-        key = tuple(sorted({*timesteps.tolist()})), guidance_scale, self.execution, weights
+        key = tuple(sorted({*timesteps.tolist()})), guidance_scale, self.pag_scale, self.execution, weights
         if self._denoiser is not None and self._denoiser[0] == key:
             if labels <= self._denoiser[1]:
                 return self._denoiser[2]
             labels |= self._denoiser[1]
         self._denoiser = None  # Free the old graph before the next capture.
-        with self.execution.autocast(self.device):
-            model = with_guidance(self.dit.precompute_conditioning(timesteps.tolist(), labels), null, guidance_scale)
-        self._denoiser = key, labels, self.execution.wrap(model, self.device)
-        return self._denoiser[2]
+
+        def build(pag_scale: float) -> Denoiser:
+            with self.execution.autocast(self.device):
+                model = self.dit.precompute_conditioning(timesteps.tolist(), labels, pag_scale)
+            return self.execution.wrap(with_guidance(model, null, guidance_scale), self.device)
+
+        model = build(0.0)
+        if self.pag_scale:
+            model = switch_at_timestep(PAG_INTERVAL * self.diffusion.num_timesteps, build(self.pag_scale), model)
+        self._denoiser = key, labels, model
+        return model
 
     def resolve_noise_scaling(self, noise_scaling: float | None) -> float:
         """Return a noise scaling, or the default of the current sampler if the argument is None.

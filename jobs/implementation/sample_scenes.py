@@ -36,6 +36,7 @@ def sample(config: Config) -> str:
         sampler=config.sampler,
         noise_scaling=config.noise_scaling,
         existence_threshold=config.existence_threshold,
+        pag_scale=config.pag_scale,
         constraints=config.constraints,
         repair=config.repair,
         shard_scenes=min(64, max(1, -(-config.num_scenes // 8))),

@@ -99,6 +99,7 @@ def sweep_samplers(config: Config) -> list[dict]:
                     guidance_scale=guidance,
                     sampler=sampler,
                     noise_scaling=scaling,
+                    pag_scale=config.pag_scale,
                     constraints=config.constraints,
                     # The shard size does not depend on the number of actors, so this number may change on resumption.
                     shard_scenes=max(1, config.num_scenes // 8),

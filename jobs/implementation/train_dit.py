@@ -266,7 +266,9 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
                 "use equal values"
             )
     inherited = {"shift": built["shift"], "scale": built["scale"], "schedule": pipeline.dit.diffusion}
-    sampling = {key: pipeline.config[key] for key in ("noise_scaling", "existence_threshold", "constraints")}
+    sampling = {
+        key: pipeline.config[key] for key in ("noise_scaling", "existence_threshold", "constraints", "pag_scale")
+    }
     return Start(digest_weights(pipeline.dit), inherited, sampling, pipeline.dit.state_dict())
 
 
@@ -293,7 +295,7 @@ def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
 
     Args:
         lvae: Directory of the layout VAE.
-        sampling: Values of `noise_scaling`, `existence_threshold`, `neighbour_latents`, `constraints`, `attach`.
+        sampling: Entries of the config of the pipeline, such as `noise_scaling`.
         output: Directory that contains dit/. This directory is also returned.
     """
     dit = DiT.from_pretrained(storage.join_uri(output, "dit"))

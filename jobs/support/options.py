@@ -32,6 +32,13 @@ ConstraintsOption = Annotated[
         " streets; write --constraints or --no-constraints (default: as the model stores)."
     ),
 ]
+PagScaleOption = Annotated[
+    float | None,
+    tyro.conf.arg(
+        help="Scale of perturbed-attention guidance, which makes scenes more coherent for up to half more time; 0"
+        " switches it off (default: as the model stores)."
+    ),
+]
 GpusOption = Annotated[
     float | None,
     tyro.conf.arg(
@@ -80,6 +87,7 @@ class GenerationOptions(SceneOptions):
     """Random seed."""
     guidance_scale: float = 1.0
     """Classifier-free guidance scale; 1 switches guidance off."""
+    pag_scale: PagScaleOption = None
     constraints: ConstraintsOption = None
     num_actors: int = 1
     """Number of pipelines that run in parallel; use one per GPU."""

@@ -304,6 +304,20 @@ def with_guidance(model: Denoiser, null_label: int, scale: float) -> Denoiser:
     return predict
 
 
+def switch_at_timestep(limit: float, noisy: Denoiser, clean: Denoiser) -> Denoiser:
+    """Use one model at noisy timesteps and another model at the other timesteps.
+
+    Args:
+        limit: Lowest timestep of the first model.
+        noisy: Model for timesteps from `limit` on.
+        clean: Model for timesteps below `limit`.
+
+    Returns:
+        A model for all timesteps. All samples of a batch must have the same timestep.
+    """
+    return lambda latent, timestep, label: (noisy if timestep[0] >= limit else clean)(latent, timestep, label)
+
+
 def scale_noise(model: Denoiser, noise_scaling: float) -> Denoiser:
     """Divide the predicted noise of a model by a number near 1.
 

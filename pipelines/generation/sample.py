@@ -72,6 +72,7 @@ class SampleRequest(Request):
         noise_scaling: Noise scaling. None: the value that the model stores.
         existence_threshold: Minimum existence probability. None: the value that the model stores.
         constraints: Whether constraints guide sampling. None: the value that the model stores.
+        pag_scale: Scale of perturbed-attention guidance. None: the value that the model stores.
         repair: Whether floating, sunken and overlapping primitives are moved; none are removed
             (pipelines/editing/edit.py).
         shard_scenes: Number of scenes per shard.
@@ -87,6 +88,7 @@ class SampleRequest(Request):
     noise_scaling: float | None = None
     existence_threshold: float | None = None
     constraints: bool | None = None
+    pag_scale: float | None = None
     repair: bool = False
     shard_scenes: int = 64
     execution: SamplingExecution = field(default_factory=SamplingExecution)
@@ -148,7 +150,7 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
         del options["execution"]["cuda_graphs"]  # CUDA graphs run the same kernels.
     # Records written by earlier versions lack these options.
     execution = {"precision": "fp32", "compile": False, "decode_batch_size": 1}
-    defaults = {"constraints": False, "repair": False, "execution": execution}
+    defaults = {"constraints": False, "pag_scale": 0.0, "repair": False, "execution": execution}
     options = {name: value for name, value in options.items() if name not in defaults or value != defaults[name]}
     # The sampler uses the noise scaling only if eta is not 1.
     if "repaint" in options and options["repaint"]["eta"] != 1:
@@ -222,6 +224,7 @@ class Sampler:
         self.request, self.batch_size = request, batch_size
         self.pipeline = load_pipeline(request.model)
         self.pipeline.use_sampler(request.sampler)
+        self.pipeline.use_pag(request.pag_scale)
         self.pipeline.set_execution(request.execution)
         self.repair = Repair(slab_offset_m=self.pipeline.spec.slab_offset_m, drop=False)
 
@@ -297,6 +300,7 @@ def sample_scenes(
         noise_scaling=pipeline.resolve_noise_scaling(request.noise_scaling),
         existence_threshold=pipeline.resolve_existence_threshold(request.existence_threshold),
         constraints=pipeline.resolve_constraints(request.constraints),
+        pag_scale=pipeline.resolve_pag_scale(request.pag_scale),
     )
     guard_generation_run(request, pipeline)
     for shard in request.shards()[:1]:

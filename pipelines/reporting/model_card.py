@@ -119,13 +119,16 @@ class ModelCard:
         yield "```python\nfrom models import PrITTIPipeline\n"
         yield f'pipeline = PrITTIPipeline.from_pretrained("{self.name}")'
         yield (
-            f'pipeline.use_sampler("dpm++")\nscenes = pipeline.generate(["{self.labels[0]}"], seed=0, '
-            "num_inference_steps=20)\n```\n"
+            f'pipeline.use_sampler("{self.sampling["sampler"]}")\n'
+            f'scenes = pipeline.generate(["{self.labels[0]}"], seed=0, '
+            f"num_inference_steps={self.sampling['num_inference_steps']})\n```\n"
         )
         yield (
             f"![First scenes without selection](samples.png)\n\n*First scenes of seed {self.sampling['seed']}, without "
             f"selection. Labels alternate: {', '.join(self.sampling['labels'])}. Sampler {self.sampling['sampler']}, "
             f"{self.sampling['num_inference_steps']} steps, guidance scale {self.sampling['guidance_scale']:g}, "
+            f"PAG scale {self.sampling.get('pag_scale', 0):g}, "
+            f"{'with' if self.sampling.get('constraints') else 'without'} constraints, "
             f"noise scaling {self.sampling.get('noise_scaling', 1):g}, existence threshold "
             f"{self.sampling.get('existence_threshold', EXISTENCE_THRESHOLD):g}.*\n"
         )

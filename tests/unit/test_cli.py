@@ -90,6 +90,7 @@ def test_option_modules_import_nothing_heavy():
 SHARED = (
     "ConstraintsOption",
     "ModelOption",
+    "PagScaleOption",
     "IfBusyOption",
     "GpusOption",
     "WaitForResourcesOption",

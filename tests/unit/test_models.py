@@ -2,10 +2,12 @@
 
 import itertools
 import re
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from diffusers.models.attention_processor import Attention, PAGIdentitySelfAttnProcessor2_0
 from helpers import random_scene, small_spec
 from safetensors.torch import load_file
 from scipy import ndimage
@@ -14,7 +16,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from models.batch import LayoutBatch
-from models.dit import DiT
+from models.dit import DiT, DiTBlock
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset
@@ -633,6 +635,47 @@ def test_dit_is_conditioned_and_starts_at_zero():
     for other in ((torch.tensor([0, 5, 999]), label), (time, torch.tensor([0, 2, 3])), (time + 1, label)):
         with pytest.raises(IndexError):
             prepared(latent, *other)
+
+
+def test_perturbed_block_attends_like_pag_of_diffusers():
+    block, x = DiTBlock(32, 2), torch.randn(3, 7, 32)
+    theirs = Attention(32, heads=2, dim_head=16, bias=True, processor=PAGIdentitySelfAttnProcessor2_0())
+    with torch.no_grad():
+        for layer, rows in zip((theirs.to_q, theirs.to_k, theirs.to_v), block.qkv.weight.chunk(3), strict=True):
+            layer.weight.copy_(rows)
+        for layer, rows in zip((theirs.to_q, theirs.to_k, theirs.to_v), block.qkv.bias.chunk(3), strict=True):
+            layer.bias.copy_(rows)
+        theirs.to_out[0].load_state_dict(block.out.state_dict())
+        block.mlp_out.weight.zero_()  # Only the attention remains: no shift and scale, all gates 1.
+        block.mlp_out.bias.zero_()
+    modulation = torch.tensor([0.0, 0, 1, 0, 0, 1]).repeat_interleave(32).repeat(3, 1)
+    y = torch.nn.functional.layer_norm(x, (32,), eps=1e-6)
+    plain, perturbed = theirs(torch.cat([y, y])).chunk(2)
+    assert torch.allclose(block(x, modulation) - x, plain, atol=1e-5)
+    assert torch.allclose(block(x, modulation, perturb=True) - x, perturbed, atol=1e-5)
+    assert not torch.allclose(plain, perturbed, atol=1e-2)
+
+
+def test_pag_moves_noise_away_from_perturbed_network():
+    torch.manual_seed(0)
+    dit = DiT(channels=4, size=8, width=32, depth=4, heads=2, prediction="v_prediction")
+    for parameter in dit.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    latent, time, label = torch.randn(3, 4, 8, 8), torch.tensor([0, 500, 999]), torch.tensor([0, 1, 3])
+    plain = dit(latent, time, label)
+
+    def predict(pag_scale):
+        return dit.precompute_conditioning(time.tolist(), label.tolist(), pag_scale)(latent, time, label)
+
+    guided = {scale: predict(scale) for scale in (0.0, 1.0, 3.0)}
+    assert torch.allclose(guided[0.0], plain, atol=1e-5)
+    middle = dit.blocks[2]
+    original, middle.forward = middle.forward, partial(middle.forward, perturb=True)
+    perturbed = dit(latent, time, label)
+    middle.forward = original
+    assert (perturbed - plain).abs().max() > 1e-3
+    for scale in (1.0, 3.0):
+        assert torch.allclose(guided[scale], plain + scale * (plain - perturbed), atol=1e-5)
 
 
 def test_dit_unpatchify_inverts_patchify():

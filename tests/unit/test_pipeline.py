@@ -1,5 +1,6 @@
 """Tests of PrITTIPipeline without Ray: samplers, seeds, conventions of diffusers and inpainting."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import shapely
 import torch
 from diffusers import DPMSolverMultistepScheduler
-from helpers import LATENT_SHAPE, QUICK, random_scene, scenes_equal, small_spec
+from helpers import LATENT_SHAPE, QUICK, random_scene, scenes_equal, small_spec, tiny_pipeline
 
 from models.composition.inpaint import (
     composite_scenes,
@@ -121,6 +122,32 @@ def test_pipeline_noise_scaling_skips_ddpm_of_paper(pipeline, tmp_path):
     with pytest.raises(ValueError, match=r"noise_scaling is 2.0, expected 0.9 to 1.1"):
         sample_with("dpm++", noise_scaling=2.0)
     pipeline.use_sampler("ddpm")
+
+
+def test_pipeline_stores_pag_scale_and_guides_noisy_timesteps(tmp_path):
+    stored = tiny_pipeline(SPEC)
+    stored.register_to_config(pag_scale=2.0)
+    stored.save_pretrained(tmp_path)
+    loaded = PrITTIPipeline.from_pretrained(tmp_path)
+    assert loaded.pag_scale == 2.0 and loaded.resolve_pag_scale(None) == 2.0
+    with torch.no_grad():
+        for parameter in loaded.dit.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
+    latent, label = torch.randn(2, *loaded.latent_shape), torch.tensor([0, 1])
+    noises = {}
+    for scale in (2.0, 0.0):
+        loaded.use_pag(scale)
+        denoise = loaded.make_denoiser(torch.tensor([900, 200, 199, 5]), label)
+        noises[scale] = [denoise(latent, torch.full((2,), timestep), label) for timestep in (900, 200, 199, 5)]
+    alike = [torch.equal(*pair) for pair in zip(*noises.values(), strict=True)]
+    assert alike == [False, False, True, True]
+    for scale in (-1.0, 21.0):
+        with pytest.raises(ValueError, match=rf"pag_scale is {scale}, expected 0 to 20"):
+            loaded.use_pag(scale)
+    index = json.loads((tmp_path / "model_index.json").read_text())
+    (tmp_path / "model_index.json").write_text(json.dumps(index | {"pag_scale": -1}))
+    with pytest.raises(ValueError, match="pag_scale"):
+        PrITTIPipeline.from_pretrained(tmp_path)
 
 
 def test_pipeline_decodes_objects_above_its_threshold(pipeline, tmp_path):
