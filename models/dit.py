@@ -374,9 +374,9 @@ class DiT(ConfiguredModel):
     ) -> Float[Tensor, "batch c h w"]:
         """Predict the noise in latents with precomputed modulations.
 
-        Perturbed-attention guidance (PAG; Ahn et al., ECCV 2024) moves the prediction away from that of a worse
-        network: the same network, but in its middle block, each token attends only to itself. Both networks share the
-        blocks before this block, so that the guidance costs half an evaluation.
+        Perturbed-attention guidance (PAG; Ahn et al., ECCV 2024) extrapolates from the prediction of a perturbed
+        network to that of the network. In the perturbed network, each token of the block depth // 2 (counted from 0)
+        attends only to itself. Both networks share the blocks before, so the guidance costs half an evaluation.
 
         Args:
             latent: Noisy latents.

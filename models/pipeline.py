@@ -60,7 +60,7 @@ COMPONENTS = {"lvae": LayoutVAE, "dit": DiT}
 NEIGHBOUR_LATENTS = ("reencode", "copy", "paper")
 SCHEDULER_CONFIG = "scheduler/scheduler_config.json"
 MAX_PAG_SCALE = 20.0
-PAG_INTERVAL = 0.2  # Share of the timesteps, the least noisy ones, without perturbed-attention guidance.
+PAG_START = 0.2  # Lowest timestep with perturbed-attention guidance, as a share of the number of timesteps.
 INDEX_RULES: dict[str, Rule] = {
     **dict.fromkeys((*COMPONENTS, "scheduler"), Sequential(Text(), 2, 2)),
     "noise_scaling": Number(0.9, 1.1),
@@ -296,7 +296,9 @@ class PrITTIPipeline:
         self.scheduler_config.require_schedule(self.dit.diffusion)
 
     def register_to_config(self, **changes: Any) -> None:
-        """Replace entries of `config`, such as `noise_scaling`. `use_constraints` and `use_pag` apply the new defaults.
+        """Replace entries of `config`, such as `noise_scaling`.
+
+        Call `use_constraints(None)` and `use_pag(None)` afterwards to apply new defaults of these two.
 
         Args:
             **changes: New values by name.
@@ -372,7 +374,7 @@ class PrITTIPipeline:
         """Set the scale of perturbed-attention guidance for sampling, inpainting and outpainting.
 
         Args:
-            pag_scale: Scale; 0 switches the guidance off; None: the default of the pipeline.
+            pag_scale: Scale from 0 (no guidance) to MAX_PAG_SCALE; None: the default of the pipeline.
 
         Raises:
             ValueError: The scale is out of range.
@@ -391,11 +393,10 @@ class PrITTIPipeline:
         Raises:
             ValueError: The scale is out of range.
         """
-        if pag_scale is None:
-            return self.config.pag_scale
-        if not 0 <= pag_scale <= MAX_PAG_SCALE:
-            raise ValueError(f"pag_scale is {pag_scale}, expected 0 to {MAX_PAG_SCALE:g}; 0 switches the guidance off")
-        return pag_scale
+        scale = self.config.pag_scale if pag_scale is None else pag_scale
+        if not 0 <= scale <= MAX_PAG_SCALE:
+            raise ValueError(f"pag_scale is {scale}, expected 0 to {MAX_PAG_SCALE:g}; 0 switches the guidance off")
+        return scale
 
     @contextmanager
     def _guide(
@@ -560,8 +561,8 @@ class PrITTIPipeline:
     ) -> Denoiser:
         """Return the DiT with guidance and precomputed modulations, run as `set_execution` says.
 
-        Perturbed-attention guidance applies to the conditional and to the unconditional noise, and only at noisy
-        timesteps (a limited interval; Kynkäänniemi et al., NeurIPS 2024).
+        Perturbed-attention guidance applies to the conditional and to the unconditional noise, and only to timesteps
+        from PAG_START on (a limited interval; Kynkäänniemi et al., NeurIPS 2024).
 
         The last denoiser is kept for batches with the same timesteps, so they share a CUDA graph. It is made again if a
         batch has a new label, or if weights change; changes through `weight.data` are not noticed.
@@ -584,14 +585,17 @@ class PrITTIPipeline:
             labels |= self._denoiser[1]
         self._denoiser = None  # Free the old graph before the next capture.
 
-        def build(pag_scale: float) -> Denoiser:
+        def build(steps: list[int], pag_scale: float) -> Denoiser:
             with self.execution.autocast(self.device):
-                model = self.dit.precompute_conditioning(timesteps.tolist(), labels, pag_scale)
+                model = self.dit.precompute_conditioning(steps, labels, pag_scale)
             return self.execution.wrap(with_guidance(model, null, guidance_scale), self.device)
 
-        model = build(0.0)
-        if self.pag_scale:
-            model = switch_at_timestep(PAG_INTERVAL * self.diffusion.num_timesteps, build(self.pag_scale), model)
+        start = PAG_START * self.diffusion.num_timesteps if self.pag_scale else float("inf")
+        guided, plain = ([int(t) for t in timesteps if (t >= start) == side] for side in (True, False))
+        if not guided or not plain:
+            model = build(guided or plain, self.pag_scale if guided else 0.0)
+        else:
+            model = switch_at_timestep(start, build(guided, self.pag_scale), build(plain, 0.0))
         self._denoiser = key, labels, model
         return model
 
