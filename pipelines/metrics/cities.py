@@ -1,0 +1,245 @@
+"""Measure large scenes window by window, to find out whether a city changes with the distance from its centre.
+
+A window is a square with sides of WINDOW_M, the size of a scene that a model generates at once. Window (i, j) lies i
+windows ahead of the first one and j windows to its left. The ring of a window is max(|i|, |j|): ring 0 is the first
+window, and ring 1 consists of the eight windows around it. Windows that reach beyond the scene are left out.
+
+Streets, junctions and blocks are measured on the whole scene, because the border of a window would cut them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from models.scene import CATEGORIES, GROUND_CLASSES, ROAD_CLASSES, Grid, Scene
+from pipelines.geometry.centerlines import RoadNetwork, extract_road_network
+from pipelines.geometry.masks import label_parts
+from pipelines.metrics.relations import fuse_ground
+
+WINDOW_M = 64.0
+HECTARE_M2 = 10_000.0
+BORDER_M = 4.0  # A road that ends this close to the border of the scene continues outside.
+ANGLE_EDGES_DEG = np.linspace(0, 180, 19)
+MIN_BLOCK_M2 = 100.0  # Smaller areas between roads are traffic islands.
+DIRECTIONS = ("centre", "ahead", "left", "behind", "right")
+
+QUANTITIES = (
+    *(f"{category}_per_ha" for category in CATEGORIES),
+    *(f"{name}_share" for name in GROUND_CLASSES),  # Share of the area of the window.
+    "annotated_share",  # Share of the area with ground of any class.
+    "road_m_per_ha",  # Length of the centrelines of roads (m).
+    "junctions_per_ha",
+    "dead_ends_per_ha",
+    "slope",  # Mean inclination of the ground (m per m).
+    "step_m",  # 99 % quantile of the height differences of neighbouring pixels.
+    "level_m",  # Mean height of the ground (scene frame).
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """One window of a city.
+
+    Attributes:
+        scene: Content of the window, moved to the frame of a scene of the model: x from 0 to WINDOW_M, y from
+            -WINDOW_M / 2 to WINDOW_M / 2. Heights are those of the city.
+        ahead: Number of windows between this one and the first one along x; negative behind it.
+        left: Number of windows between this one and the first one along y; negative to the right.
+    """
+
+    scene: Scene
+    ahead: int
+    left: int
+
+    @property
+    def ring(self) -> int:
+        """Ring of the window; 0 for the first window."""
+        return max(abs(self.ahead), abs(self.left))
+
+    @property
+    def direction(self) -> str:
+        """Direction from the first window: one of DIRECTIONS. Windows on a diagonal are ahead or behind."""
+        if not self.ring:
+            return DIRECTIONS[0]
+        if abs(self.ahead) >= abs(self.left):
+            return "ahead" if self.ahead > 0 else "behind"
+        return "left" if self.left > 0 else "right"
+
+
+@dataclass(frozen=True, eq=False)
+class CityMeasurement:
+    """Measures of the n windows of a city, and of the whole city.
+
+    Attributes:
+        windows: Windows, in the order of the rows of the arrays.
+        quantities: Values of QUANTITIES per window; NaN where a value is undefined.
+        angles_m: Length of the road centrelines of each window by direction, in bins of ANGLE_EDGES_DEG (m). The
+            direction is measured from the x axis of the city.
+        blocks_m2: Areas of the blocks: parts between roads that do not touch the border of the city (m^2).
+        connectivity: Share of road pixels in the largest 4-connected part; NaN without road.
+    """
+
+    windows: list[Window]
+    quantities: np.ndarray  # (n, len(QUANTITIES))
+    angles_m: np.ndarray  # (n, 18)
+    blocks_m2: np.ndarray  # (b,)
+    connectivity: float
+
+
+def list_window_grids(grid: Grid, center_m: tuple[float, float] | None = None) -> list[tuple[int, int, Grid]]:
+    """List the windows of a grid.
+
+    Args:
+        grid: Grid of the city.
+        center_m: Centre (x, y) of the first window (m, scene frame), rounded to whole pixels. None: centre of the grid.
+
+    Returns:
+        For each window that lies entirely in the grid: number of windows ahead, to the left, and its grid.
+
+    Raises:
+        ValueError: The side of a window is no even number of pixels, or no window fits into the grid.
+    """
+    pixels = round(WINDOW_M / grid.resolution_m)
+    if abs(pixels * grid.resolution_m - WINDOW_M) > 1e-6 or pixels % 2:
+        raise ValueError(f"pixels of {grid.resolution_m} m: {WINDOW_M:g} m are no even number of pixels")
+    x_m, y_m = center_m or ((grid.front_m + grid.back_m) / 2, (grid.left_m + grid.right_m) / 2)
+    starts = [
+        round((edge_m - middle_m) / grid.resolution_m) - pixels // 2
+        for edge_m, middle_m in ((grid.front_m, x_m), (grid.left_m, y_m))
+    ]
+    steps = [
+        range(-((count - pixels - start) // pixels), start // pixels + 1)
+        for start, count in zip(starts, (grid.rows, grid.cols), strict=True)
+    ]
+    found = []
+    for i in steps[0]:
+        for j in steps[1]:
+            front_m = grid.front_m - (starts[0] - i * pixels) * grid.resolution_m
+            left_m = grid.left_m - (starts[1] - j * pixels) * grid.resolution_m
+            found.append((i, j, Grid(front_m, left_m, grid.resolution_m, pixels, pixels)))
+    if not found:
+        raise ValueError(
+            f"{grid.rows} x {grid.cols} pixels of {grid.resolution_m} m hold no window of {WINDOW_M:g} m around"
+            f" ({x_m:g}, {y_m:g})"
+        )
+    return found
+
+
+def measure_city(city: Scene, center_m: tuple[float, float] | None = None) -> CityMeasurement:
+    """Measure the windows of a large scene, and the whole scene.
+
+    Args:
+        city: Scene, at least as large as one window.
+        center_m: Centre (x, y) of the first window (m, scene frame). None: centre of the scene.
+
+    Returns:
+        The measures.
+
+    Raises:
+        ValueError: No window fits into the scene (`list_window_grids`).
+    """
+    places = list_window_grids(city.grid, center_m)
+    height_m, classes = fuse_ground(city)
+    network = extract_road_network(city)
+    junctions_m, ends_m = network.nodes_m[:, :2], find_dead_ends(network, city.grid)
+    middle_m, length_m, bins = _split_roads(network)
+    windows, rows, angles = [], [], []
+    for ahead, left, grid in places:
+        scene = city.crop(grid)
+        moved = scene.translate(WINDOW_M - grid.front_m, WINDOW_M / 2 - grid.left_m)
+        windows.append(Window(replace(moved, scene_id=f"{city.scene_id}/{ahead:+d}{left:+d}"), ahead, left))
+        here, _ = city.grid.intersect(grid)
+        inside = grid.contains(middle_m[:, 0], middle_m[:, 1])
+        angles.append(np.bincount(bins[inside], length_m[inside], minlength=len(ANGLE_EDGES_DEG) - 1))
+        streets = (
+            angles[-1].sum(),
+            *(grid.contains(points_m[:, 0], points_m[:, 1]).sum() for points_m in (junctions_m, ends_m)),
+        )
+        rows.append(_measure_window(scene, height_m[here], classes[here], streets))
+    roads = np.isin(classes, [GROUND_CLASSES.index(name) for name in ROAD_CLASSES])
+    return CityMeasurement(
+        windows,
+        np.array(rows),
+        np.array(angles),
+        measure_blocks_m2(roads, city.grid.resolution_m),
+        _measure_connectivity(roads),
+    )
+
+
+def _measure_window(scene: Scene, height_m: np.ndarray, classes: np.ndarray, streets: tuple[float, ...]) -> list[float]:
+    """Return the values of QUANTITIES of a window, of which `streets` holds those of the road network per window."""
+    hectares = WINDOW_M**2 / HECTARE_M2
+    known = classes >= 0
+    shares = np.bincount(classes[known], minlength=len(GROUND_CLASSES)) / classes.size
+    steps_m = np.concatenate(
+        [
+            np.abs(np.diff(height_m, axis=axis))[(np.diff(known.astype(np.int8), axis=axis) == 0) & pair]
+            for axis, pair in ((0, known[1:]), (1, known[:, 1:]))
+        ]
+    )
+    heights = [np.nan] * 3
+    if len(steps_m):
+        resolution_m = scene.grid.resolution_m
+        heights = [steps_m.mean() / resolution_m * np.pi / 2, np.quantile(steps_m, 0.99), height_m[known].mean()]
+    per_hectare = np.array(streets) / hectares
+    return [*(scene.counts() / hectares), *shares, known.mean(), *per_hectare, *heights]
+
+
+def find_dead_ends(network: RoadNetwork, grid: Grid) -> np.ndarray:
+    """Find the ends of roads that are neither at a junction nor at the border of the scene.
+
+    Args:
+        network: Roads.
+        grid: Grid of the scene.
+
+    Returns:
+        Positions (n, 2) (m, scene frame).
+    """
+    ends = [
+        road.xyz_m[point, :2] for road in network.roads for node, point in ((road.start, 0), (road.end, -1)) if node < 0
+    ]
+    ends_m = np.reshape(ends, (-1, 2))
+    to_border_m = np.minimum(
+        np.minimum(grid.front_m - ends_m[:, 0], ends_m[:, 0] - grid.back_m),
+        np.minimum(grid.left_m - ends_m[:, 1], ends_m[:, 1] - grid.right_m),
+    )
+    return ends_m[to_border_m > BORDER_M]
+
+
+def _split_roads(network: RoadNetwork) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return middle (p, 2), length (p,) and bin of ANGLE_EDGES_DEG (p,) of the pieces of all centrelines."""
+    lines_m = [road.xyz_m[:, :2] for road in network.roads]
+    first = np.concatenate([np.zeros((0, 2)), *(line[:-1] for line in lines_m)])
+    last = np.concatenate([np.zeros((0, 2)), *(line[1:] for line in lines_m)])
+    step_m = last - first
+    angle_deg = np.degrees(np.arctan2(step_m[:, 1], step_m[:, 0])) % 180
+    bins = np.digitize(angle_deg, ANGLE_EDGES_DEG[1:-1])
+    return (first + last) / 2, np.linalg.norm(step_m, axis=1), bins
+
+
+def measure_blocks_m2(roads: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Measure the blocks between roads.
+
+    Args:
+        roads: (H, W) bool; True for each pixel of a road.
+        resolution_m: Side of a pixel (m).
+
+    Returns:
+        Areas (b,) of the 4-connected parts without road that do not touch the border and have at least MIN_BLOCK_M2
+        (m^2).
+    """
+    parts, _ = ndimage.label(~roads)
+    border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
+    areas_m2 = np.bincount(parts.ravel()) * resolution_m**2
+    areas_m2[border] = 0
+    areas_m2[0] = 0  # Roads.
+    return areas_m2[areas_m2 >= MIN_BLOCK_M2]
+
+
+def _measure_connectivity(roads: np.ndarray) -> float:
+    """Return the share of road pixels in the largest 4-connected part; NaN without road."""
+    sizes = np.bincount(label_parts(roads)[0].ravel())[1:]
+    return float(sizes.max() / sizes.sum()) if len(sizes) else float("nan")
