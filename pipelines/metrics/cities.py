@@ -174,16 +174,14 @@ def _measure_window(scene: Scene, height_m: np.ndarray, classes: np.ndarray, str
     hectares = WINDOW_M**2 / HECTARE_M2
     known = classes >= 0
     shares = np.bincount(classes[known], minlength=len(GROUND_CLASSES)) / classes.size
-    steps_m = np.concatenate(
-        [
-            np.abs(np.diff(height_m, axis=axis))[(np.diff(known.astype(np.int8), axis=axis) == 0) & pair]
-            for axis, pair in ((0, known[1:]), (1, known[:, 1:]))
-        ]
-    )
+    down_m, right_m = np.diff(height_m, axis=0), np.diff(height_m, axis=1)
+    both_down, both_right = known[1:] & known[:-1], known[:, 1:] & known[:, :-1]
+    corner = both_down[:, :-1] & both_right[:-1]  # Pixels with ground below and to the right.
     heights = [np.nan] * 3
-    if len(steps_m):
-        resolution_m = scene.grid.resolution_m
-        heights = [steps_m.mean() / resolution_m * np.pi / 2, np.quantile(steps_m, 0.99), height_m[known].mean()]
+    if corner.any():
+        steps_m = np.concatenate([np.abs(down_m[both_down]), np.abs(right_m[both_right])])
+        slope = np.hypot(down_m[:, :-1][corner], right_m[:-1][corner]).mean() / scene.grid.resolution_m
+        heights = [slope, np.quantile(steps_m, 0.99), height_m[known].mean()]
     per_hectare = np.array(streets) / hectares
     return [*(scene.counts() / hectares), *shares, known.mean(), *per_hectare, *heights]
 
