@@ -9,6 +9,7 @@ Streets, junctions and blocks are measured on the whole scene, because the borde
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,12 +19,14 @@ from models.scene import CATEGORIES, GROUND_CLASSES, ROAD_CLASSES, Grid, Scene
 from pipelines.geometry.centerlines import RoadNetwork, extract_road_network
 from pipelines.geometry.masks import label_parts
 from pipelines.metrics.relations import fuse_ground
+from pipelines.metrics.seams import FAR_M, MEASURES, NEAR_M, measure_scene_seams
 
 WINDOW_M = 64.0
 HECTARE_M2 = 10_000.0
 BORDER_M = 4.0  # A road that ends this close to the border of the scene continues outside.
 ANGLE_EDGES_DEG = np.linspace(0, 180, 19)
 MIN_BLOCK_M2 = 100.0  # Smaller areas between roads are traffic islands.
+RECORD = (len(MEASURES), 2, 2)  # Shape of a record of seams.
 DIRECTIONS = ("centre", "ahead", "left", "behind", "right")
 
 QUANTITIES = (
@@ -241,3 +244,59 @@ def _measure_connectivity(roads: np.ndarray) -> float:
     """Return the share of road pixels in the largest 4-connected part; NaN without road."""
     sizes = np.bincount(label_parts(roads)[0].ravel())[1:]
     return float(sizes.max() / sizes.sum()) if len(sizes) else float("nan")
+
+
+def measure_seams_by_ring(
+    city: Scene, rows: Sequence[int], cols: Sequence[int], center_m: tuple[float, float] | None = None
+) -> dict[int, np.ndarray]:
+    """Measure the seams of a city by the ring in which they lie.
+
+    Each seam crosses the whole city. It is cut into pieces of WINDOW_M, and each piece is compared with nearby lines
+    (`seams.measure_scene_seams`) on a strip along the seam.
+
+    Args:
+        city: Scene.
+        rows: Pixel rows; a seam lies before each of these rows.
+        cols: Pixel columns; a seam lies before each of these columns.
+        center_m: Centre (x, y) of the first window (m, scene frame). None: centre of the scene.
+
+    Returns:
+        For each ring: sum of the records (4, 2, 2) of the seams whose middle lies in windows of this ring.
+
+    Raises:
+        ValueError: A seam lies on or beyond the edge of the scene.
+    """
+    grid = city.grid
+    for line, count in [*((row, grid.rows) for row in rows), *((col, grid.cols) for col in cols)]:
+        if not 0 < line < count:
+            raise ValueError(
+                f"scene {city.scene_id}: there is a seam before pixel {line}, expected pixels 1 to {count - 1}"
+            )
+    x_m, y_m = center_m or ((grid.front_m + grid.back_m) / 2, (grid.left_m + grid.right_m) / 2)
+    origin_px = (grid.front_m - x_m) / grid.resolution_m, (grid.left_m - y_m) / grid.resolution_m
+    side, reach = round(WINDOW_M / grid.resolution_m), round((FAR_M + NEAR_M) / grid.resolution_m)
+    found: dict[int, np.ndarray] = {}
+    for axis, lines in ((0, rows), (1, cols)):
+        counts = (grid.rows, grid.cols)
+        first_px = round(origin_px[1 - axis]) - side // 2  # Start of the first window along the seam.
+        starts = range(first_px % side, counts[1 - axis] - side + 1, side)
+        for line in lines:
+            low, high = max(0, line - reach), min(counts[axis], line + reach)
+            for start in starts:
+                ranges = [(low, high), (start, start + side)]
+                (row0, row1), (col0, col1) = ranges if axis == 0 else ranges[::-1]
+                strip = city.crop(
+                    Grid(
+                        grid.front_m - row0 * grid.resolution_m,
+                        grid.left_m - col0 * grid.resolution_m,
+                        grid.resolution_m,
+                        row1 - row0,
+                        col1 - col0,
+                    )
+                )
+                others = [other - low for other in lines if low < other < high and other != line]
+                here = ([line - low], (), others) if axis == 0 else ((), [line - low], (), others)
+                along_px, across_px = start + side / 2 - origin_px[1 - axis], line - origin_px[axis]
+                ring = round(max(abs(along_px), abs(across_px)) / side)
+                found[ring] = found.get(ring, np.zeros(RECORD)) + measure_scene_seams(strip, *here)
+    return found

@@ -33,13 +33,21 @@ END_M = 0.25  # An object ends at a line if the distance between its end and the
 DOUBLE_IOU3D = 0.05
 
 
-def measure_scene_seams(scene: Scene, rows: Sequence[int] = (), cols: Sequence[int] = ()) -> np.ndarray:
+def measure_scene_seams(
+    scene: Scene,
+    rows: Sequence[int] = (),
+    cols: Sequence[int] = (),
+    other_rows: Sequence[int] = (),
+    other_cols: Sequence[int] = (),
+) -> np.ndarray:
     """Measure the seams of one scene and the lines next to them.
 
     Args:
         scene: Scene with seams.
         rows: Pixel rows; a seam lies before each of these rows.
         cols: Pixel columns; a seam lies before each of these columns.
+        other_rows: Rows of seams that are not measured. Neighbouring lines are not close to them either.
+        other_cols: Columns of such seams.
 
     Returns:
         (4, 2, 2) record with the axes MEASURES, (seams, neighbouring lines), (numerator, denominator).
@@ -52,7 +60,9 @@ def measure_scene_seams(scene: Scene, rows: Sequence[int] = (), cols: Sequence[i
     total = np.zeros((len(MEASURES), 2, 2))
     corners_m = compute_footprint_ranges(scene)
     doubles = find_doubled_objects(scene)
-    for axis, seams, count in ((0, rows, grid.rows), (1, cols, grid.cols)):
+    for axis, seams, others, count in ((0, rows, other_rows, grid.rows), (1, cols, other_cols, grid.cols)):
+        if not seams:
+            continue
         if bad := [line for line in seams if not 0 < line < count]:
             raise ValueError(
                 f"scene {scene.scene_id}: there is a seam before pixel {bad[0]}, but seams must lie before pixels"
@@ -67,7 +77,7 @@ def measure_scene_seams(scene: Scene, rows: Sequence[int] = (), cols: Sequence[i
         at_m = grid.resolution_m * np.arange(1, count)
         objects = measure_objects(at_m, low_m, high_m, center_m, doubles)
         every = np.concatenate([across, objects], axis=1)  # Shape (lines, measures, 2).
-        for line, near in list_parallel_lines(seams, count, grid.resolution_m).items():
+        for line, near in list_parallel_lines(seams, count, grid.resolution_m, others).items():
             total[:, 0] += every[line - 1]
             total[:, 1] += every[near - 1].mean(axis=0) if len(near) else 0
     return total
@@ -99,19 +109,23 @@ def join_unrelated_scenes(far: Scene, near: Scene, row: int) -> Scene:
     )
 
 
-def list_parallel_lines(seams: Sequence[int], count: int, resolution_m: float) -> dict[int, np.ndarray]:
+def list_parallel_lines(
+    seams: Sequence[int], count: int, resolution_m: float, others: Sequence[int] = ()
+) -> dict[int, np.ndarray]:
     """List the lines with which each seam is compared.
 
     Args:
         seams: Index of the pixel after each seam.
         count: Number of pixel rows or columns.
         resolution_m: Pixel size (m).
+        others: Index of the pixel after each seam that has no neighbouring lines itself.
 
     Returns:
         Indices of the neighbouring lines, for each seam.
     """
     lines = np.arange(1, count)
-    nearest_m = np.abs(lines[:, None] - np.array(seams, int).reshape(1, -1)).min(axis=1, initial=count) * resolution_m
+    every = np.array([*seams, *others], int)
+    nearest_m = np.abs(lines[:, None] - every.reshape(1, -1)).min(axis=1, initial=count) * resolution_m
     free = lines[nearest_m >= NEAR_M]
     return {seam: free[np.abs(free - seam) * resolution_m <= FAR_M] for seam in seams}
 

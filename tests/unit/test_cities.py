@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from models.scene import CATEGORIES, CATEGORY_INDEX, KITTI_GROUND_CLASSES, Grid, Scene
-from pipelines.metrics.cities import ANGLE_EDGES_DEG, QUANTITIES, list_window_grids, measure_blocks_m2, measure_city
+from pipelines.metrics.cities import (
+    ANGLE_EDGES_DEG,
+    QUANTITIES,
+    list_window_grids,
+    measure_blocks_m2,
+    measure_city,
+    measure_seams_by_ring,
+)
 
 GRID = Grid(front_m=160, left_m=160, resolution_m=0.5, rows=640, cols=640)  # 320 m x 320 m around the origin.
 STREETS_M, WIDTH_M = (-96.0, -32.0, 32.0, 96.0), 8.0
@@ -118,3 +125,25 @@ def test_city_without_ground_has_undefined_heights():
     measured = measure_city(bare)
     assert np.isnan(measured.connectivity) and not len(measured.blocks_m2)
     assert np.isnan(get_quantity(measured, "slope")).all() and not get_quantity(measured, "annotated_share").any()
+
+
+def test_seams_have_the_ring_of_their_place():
+    city = make_city(streets_m=())
+    city.height_m[3, 320:] += 0.5  # A step across x = 0.
+    found = measure_seams_by_ring(city, rows=[128, 320], cols=[])
+    # Pieces of 64 m: rows at x = 96 m (rings 2) and x = 0 m (rings 0 to 2).
+    assert {ring: record[1, 0, 1] for ring, record in found.items()} == {0: 128, 1: 2 * 128, 2: 2 * 128 + 5 * 128}
+    steps = {ring: record[1, 0, 0] / record[1, 0, 1] for ring, record in found.items()}
+    assert steps[0] == steps[1] == pytest.approx(0.5) and steps[2] == pytest.approx(0.5 * 2 / 7)
+    assert all(not record[1, 1, 0] for record in found.values())  # Nearby lines have no step.
+    with pytest.raises(ValueError, match="seam before pixel 640, expected pixels 1 to 639"):
+        measure_seams_by_ring(city, rows=[640], cols=[])
+
+
+def test_other_seams_are_no_nearby_lines():
+    city = make_city(streets_m=())
+    city.height_m[3, 320:] += 0.5
+    city.height_m[3, :310] += 1.0  # Another seam, 5 m from the first one.
+    alone = measure_seams_by_ring(city, rows=[320], cols=[])
+    both = measure_seams_by_ring(city, rows=[310, 320], cols=[])
+    assert alone[0][1, 1, 0] > 0 and not both[0][1, 1, 0]
