@@ -12,7 +12,7 @@ import numpy as np
 
 from models.geometry.iou3d import make_boxes
 from models.geometry.suppression import find_suppressed
-from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES
+from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES, Grid, Scene, make_yaw_rotation
 from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
 from pipelines.preprocess.sources.town.districts import TOWN_KINDS
 from pipelines.preprocess.sources.town.land import Land, draw_land
@@ -83,10 +83,81 @@ def make_town(seed: int, num_free_poses: int = 0) -> Drive:
     Returns:
         The drive.
     """
+    drive, streets, land = _make_drive(seed)
+    free = _draw_free_poses(np.random.default_rng([7303, seed]), streets, land, num_free_poses)
+    return replace(
+        drive,
+        frame=np.concatenate([drive.frame, FREE_FRAMES_START + np.arange(len(free))]),
+        world_from_imu=np.concatenate([drive.world_from_imu, free]),
+        free_pose=np.arange(len(drive) + len(free)) >= len(drive),
+    )
+
+
+def make_large_scene(seed: int, extent_m: float, resolution_m: float = 0.25) -> Scene:
+    """Make a square scene of a town with as many streets as its extent needs, to compare it with generated cities.
+
+    The middle of the scene is the crop ahead of a pose of a vehicle, as in a city that outpainting extends. As in crops
+    at free poses, there are no moving objects.
+
+    Args:
+        seed: Seed of the town.
+        extent_m: Side of the scene (m).
+        resolution_m: Side of a pixel (m).
+
+    Returns:
+        The scene, in the frame of the pose, whose crop spans x from 0 to FREE_CROP_M.
+
+    Raises:
+        ValueError: The side is smaller than a crop, or no whole number of pixels.
+        RuntimeError: No pose lies so that the scene fits into the town.
+    """
+    pixels, margin_m = round(extent_m / resolution_m), (extent_m - FREE_CROP_M) / 2
+    if margin_m < 0 or abs(pixels * resolution_m - extent_m) > 1e-6:
+        raise ValueError(
+            f"extent_m is {extent_m:g}, expected at least {FREE_CROP_M:g} m and a multiple of {resolution_m:g} m"
+        )
+    grid = Grid(FREE_CROP_M + margin_m, extent_m / 2, resolution_m, pixels, pixels)
+    main, _ = TOWN_KINDS[seed % len(TOWN_KINDS)]
+    # The diagonal, because a street may have any direction.
+    count = 2 + int(np.ceil((np.sqrt(2) * extent_m + FREE_CROP_M) / SPACING_M[main][0]))
+    drive, streets, land = _make_drive(seed, (count, count))
+    low, high = _find_built_area(streets)
+    middle = (low + high) / 2
+    side = np.linspace(-1, 1, 9)
+    outline = np.concatenate(
+        [np.column_stack([side, np.full(9, end)]) for end in (-1, 1)]
+        + [np.column_stack([np.full(9, end), side]) for end in (-1, 1)]
+    )
+    outline_m = outline * extent_m / 2 + [FREE_CROP_M / 2, 0]
+    places = land.uv(drive.world_from_imu[:, :2, 3])
+    for index in np.argsort(np.linalg.norm(places - middle, axis=1)):
+        pose = drive.pose(int(index))
+        edge_m = outline_m @ make_yaw_rotation(pose.yaw_rad)[:2, :2].T + pose.xyz_m[:2]
+        inside = land.uv(edge_m)
+        if (inside >= low).all() and (inside <= high).all():
+            still = replace(drive, frame=np.full(len(drive), FREE_FRAMES_START))  # No moving box belongs to this frame.
+            return still.scene(int(index), "test", grid)
+    raise RuntimeError(f"no crop of {extent_m:g} m fits into town {seed}")
+
+
+def _find_built_area(streets: Streets) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and the upper corner (u, v) of the area in which crops may lie."""
+    low = np.array([streets.u_m[0], streets.v_m[0]]) - FREE_MARGIN_M
+    high = np.array([streets.u_m[-1], streets.v_m[-1]]) + FREE_MARGIN_M
+    return low, high
+
+
+def _make_drive(seed: int, num_blocks: tuple[int, int] | None = None) -> tuple[Drive, Streets, Land]:
+    """Make a town and the poses of a vehicle.
+
+    Args:
+        seed: Seed of the town.
+        num_blocks: Number of blocks along u and v. None: those of a usual town.
+    """
     rng = np.random.default_rng([7302, seed])
     main, edge = TOWN_KINDS[seed % len(TOWN_KINDS)]
     land = _skew_land(rng, draw_land(rng))
-    columns, rows = (4, 5) if main != "green" else (4, 4)
+    columns, rows = num_blocks or ((4, 5) if main != "green" else (4, 4))
     split = 3 if rng.random() < 0.5 else columns - 1
     spacing_u = [rng.uniform(*SPACING_M[main if i < split else edge]) for i in range(columns)]
     spacing_v = [rng.uniform(*SPACING_M[main]) for _ in range(rows)]
@@ -108,17 +179,16 @@ def make_town(seed: int, num_free_poses: int = 0) -> Drive:
     ground = collect_ground(sheet, land)
     boxes = _settle_boxes(collect_boxes(sheet, rng, land), ground, land)
     boxes = _remove_overlapping(_sink_boxes(boxes, np.random.default_rng([7304, seed])))
-    free = _draw_free_poses(np.random.default_rng([7303, seed]), streets, land, num_free_poses)
-    return Drive(
+    drive = Drive(
         source="town",
         sequence=f"{seed:05d}",
         **boxes,
         ground_classes=KITTI_GROUND_CLASSES,
         ground=ground,
-        frame=np.concatenate([frame, FREE_FRAMES_START + np.arange(len(free))]),
-        world_from_imu=np.concatenate([make_poses(rng, route, at, land), free]),
-        free_pose=np.arange(len(frame) + len(free)) >= len(frame),
+        frame=frame,
+        world_from_imu=make_poses(rng, route, at, land),
     )
+    return drive, streets, land
 
 
 # ---------------------------------------------------------------- streets
@@ -214,8 +284,7 @@ def _draw_free_poses(rng: np.random.Generator, streets: Streets, land: Land, cou
 
     The first poses do not depend on `count`.
     """
-    low = np.array([streets.u_m[0], streets.v_m[0]]) - FREE_MARGIN_M
-    high = np.array([streets.u_m[-1], streets.v_m[-1]]) + FREE_MARGIN_M
+    low, high = _find_built_area(streets)
     poses = np.empty((count, 3, 4))
     square = np.array([[0, 1], [1, 1], [1, -1], [0, -1]]) * [FREE_CROP_M, FREE_CROP_M / 2]
     found = 0

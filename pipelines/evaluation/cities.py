@@ -1,0 +1,438 @@
+"""Compare the windows of large scenes with data, ring by ring, with Ray tasks.
+
+A city is cut into windows of the size of a scene (pipelines/metrics/cities.py). The windows of each group of rings are
+written as a source of a dataset directory, and scored like generated scenes against crops of the data. The ceiling are
+windows of large procedural towns, which have no centre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.distance import jensenshannon
+
+from models.composition.outpaint import BlockGrid
+from models.scene import VEGETATION, VEHICLES, Scene
+from pipelines.evaluation.evaluate import compute_scene_means
+from pipelines.evaluation.features import READER_CPUS
+from pipelines.generation.outpaint import RANKS
+from pipelines.metrics.cities import (
+    DIRECTIONS,
+    HECTARE_M2,
+    QUANTITIES,
+    RECORD,
+    WINDOW_M,
+    measure_city,
+    measure_seams_by_ring,
+)
+from pipelines.metrics.intervals import Estimate
+from pipelines.metrics.relations import fuse_ground
+from pipelines.metrics.seams import estimate_seam_ratios
+from pipelines.preprocess.sources.town.version2.town import make_large_scene
+from pipelines.rendering.render import render_bev
+from pipelines.runtime import storage
+from pipelines.runtime.ray_tasks import map_tasks
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.density_labels import classify_density
+from pipelines.schema.scene_subset import SceneSubset, select_evenly
+from pipelines.schema.tables import Shard
+
+CENTRE_M = (WINDOW_M / 2, 0.0)  # Centre of the first scene of a city, in the frame of the city.
+SPLIT = "windows"
+OVERVIEW_PX = 768
+REFERENCE, CEILING = "reference", "ceiling"
+TOWN_SEEDS_START = 2_000_000  # Towns of the ceiling have other seeds than those of datasets.
+
+
+@dataclass(frozen=True)
+class CityResult:
+    """Measures of one city.
+
+    Attributes:
+        side: Name of the set to which the city belongs.
+        city: Scene id.
+        rows: One dictionary per window: ahead, left, ring, direction, kept and QUANTITIES.
+        angles_m: (n, 18) length of centrelines by direction, per window (m).
+        blocks_m2: Areas of blocks (m^2).
+        connectivity: Share of road pixels in the largest connected part.
+        area_m2: Area of the city (m^2).
+        seams: Record (4, 2, 2) of the seams of each ring; empty if no seams are known.
+        overview: (h, w, 3) uint8 picture of the city from above.
+    """
+
+    side: str
+    city: str
+    rows: list[dict]
+    angles_m: np.ndarray
+    blocks_m2: np.ndarray
+    connectivity: float
+    area_m2: float
+    seams: dict[int, np.ndarray]
+    overview: np.ndarray
+
+
+@dataclass(frozen=True)
+class CityJob:
+    """One large scene to measure.
+
+    Attributes:
+        side: Name of the set.
+        number: Number within the set.
+        source: Shard and row of the scene, or (None, seed) for a procedural town.
+        extent_m: Side of a procedural town (m).
+        seams_m: Positions of seams along x and y in the frame of the city (m).
+        label: Densities of vegetation and vehicles that a window must have; None: any.
+    """
+
+    side: str
+    number: int
+    source: tuple[Shard | None, int]
+    extent_m: float = 0.0
+    seams_m: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+    label: tuple[str | None, str | None] = (None, None)
+
+
+def find_seams_m(block_grid: BlockGrid, cell_m: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Find the positions at which a new block meets known content, along the axes through the first block.
+
+    Args:
+        block_grid: Bounded block grid of a city.
+        cell_m: Side of a latent cell (m).
+
+    Returns:
+        Positions x and y of the seams (m, frame of the first block).
+    """
+    ahead, behind, left, right = block_grid.num_blocks or (0, 0, 0, 0)
+    found = []
+    for low, high, place in ((-behind, ahead, lambda k: (k, 0)), (-right, left, lambda k: (0, k))):
+        known = np.zeros(block_grid.step * (high - low) + block_grid.size, bool)
+        edges = set()
+        for k in sorted(range(low, high + 1), key=lambda k, place=place: block_grid.rank(place(k))):
+            start = (k - low) * block_grid.step
+            part = known[start : start + block_grid.size]
+            edges |= {start + int(at) + 1 for at in np.flatnonzero(np.diff(part.astype(int)))}
+            for edge in (start, start + block_grid.size):  # The new block ends exactly where known content starts.
+                if 0 < edge < len(known) and known[edge - 1] != known[edge]:
+                    edges.add(edge)
+            known[start : start + block_grid.size] = True
+        found.append(tuple((edge + low * block_grid.step) * cell_m for edge in sorted(edges)))
+    return found[0], tuple(y - WINDOW_M / 2 for y in found[1])
+
+
+def read_seams_m(root: str, source: str, size: int = 32) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Read the positions of seams from the record of a run of jobs/outpaint_scenes.py.
+
+    Args:
+        root: Dataset directory.
+        source: Source of the run, such as generated-outpainted.
+        size: Side of a block in latent cells.
+
+    Returns:
+        Positions along x and y (`find_seams_m`); none if there is no record.
+    """
+    path = storage.join_uri(root, f"{source}.json")
+    if not storage.exists(path):
+        return (), ()
+    options = storage.read_json(path)
+    if not {"overlap", "num_blocks", "order"} <= set(options):
+        return (), ()
+    grid = BlockGrid.from_overlap(
+        size, options["overlap"], rank=RANKS[options["order"]], num_blocks=tuple(options["num_blocks"])
+    )
+    return find_seams_m(grid, WINDOW_M / size)
+
+
+def find_origin_level_m(scene: Scene) -> float:
+    """Return the height of the ground at the pixel with ground that is nearest to (0, 0); NaN without ground."""
+    height_m, classes = fuse_ground(scene)
+    rows, cols = np.nonzero(classes >= 0)
+    if not len(rows):
+        return float("nan")
+    x_m, y_m = scene.grid.x_m()[rows], scene.grid.y_m()[cols]
+    nearest = np.hypot(x_m, y_m).argmin()
+    return float(height_m[rows[nearest], cols[nearest]])
+
+
+def judge_label(scene: Scene, dataset: Dataset) -> tuple[str, str]:
+    """Return the densities of vegetation and vehicles of a scene by the thresholds of a dataset."""
+    volume_m3 = scene.size_m.prod(axis=1) if len(scene) else np.zeros(0)
+    found = []
+    for group, thresholds in ((VEGETATION, dataset.vegetation), (VEHICLES, dataset.vehicle)):
+        among = np.isin(scene.category, group)
+        found.append(str(classify_density(among.sum(), volume_m3[among].sum(), thresholds)))
+    return found[0], found[1]
+
+
+def measure_city_windows(job: CityJob, root: str, dataset: Dataset, level_m: float) -> CityResult:
+    """Measure one city, and write its windows to a dataset directory, one source per ring.
+
+    Args:
+        job: City.
+        root: Dataset directory of the windows.
+        dataset: Dataset with the thresholds of density labels.
+        level_m: Height of the ground at the origin of the reference scenes; windows are moved vertically to this
+            height (m).
+
+    Returns:
+        The measures.
+    """
+    shard, row = job.source
+    city = shard.scenes([row])[0] if shard else make_large_scene(row, job.extent_m, dataset.spec.grid.resolution_m)
+    measured = measure_city(city, CENTRE_M)
+    windows: dict[str, list[Scene]] = {}
+    rows = []
+    for window, values in zip(measured.windows, measured.quantities, strict=True):
+        scene, place = window.scene, (window.ahead * WINDOW_M, window.left * WINDOW_M)
+        label = judge_label(scene, dataset)
+        kept = all(wanted in (None, found) for wanted, found in zip(job.label, label, strict=True)) or bool(shard)
+        if shard is None:
+            scene = replace(scene, vegetation_density=label[0], vehicle_density=label[1])
+        own_m = find_origin_level_m(scene)
+        if np.isfinite(own_m):
+            scene = scene.translate(0.0, 0.0, level_m - own_m)
+        x_m, y_m, z_m = city.world_xyz_m
+        scene = replace(
+            scene,
+            scene_id=f"{job.side}-{job.number:04d}{window.ahead:+04d}{window.left:+04d}",
+            world_xyz_m=(x_m + place[0], y_m + place[1], z_m),
+        )
+        rows.append(
+            {"side": job.side, "city": city.scene_id, "ahead": window.ahead, "left": window.left}
+            | {"ring": window.ring, "direction": window.direction, "kept": kept}
+            | dict(zip(QUANTITIES, values.tolist(), strict=True))
+        )
+        if kept:
+            windows.setdefault(name_source(job.side, window.ring), []).append(scene)
+    for source, scenes in windows.items():
+        Shard(root, source, SPLIT, job.number).write([replace(s, source=source, split=SPLIT) for s in scenes])
+    seams = {}
+    if any(job.seams_m):
+        grid = city.grid
+        lines = (
+            [round((edge - at_m) / grid.resolution_m) for at_m in places]
+            for edge, places in zip((grid.front_m, grid.left_m), job.seams_m, strict=True)
+        )
+        seams = measure_seams_by_ring(city, *lines, center_m=CENTRE_M)
+    area_m2 = city.grid.rows * city.grid.cols * city.grid.resolution_m**2
+    return CityResult(
+        job.side,
+        city.scene_id,
+        rows,
+        measured.angles_m,
+        measured.blocks_m2,
+        measured.connectivity,
+        area_m2,
+        seams,
+        render_bev(city, OVERVIEW_PX),
+    )
+
+
+def name_group(ring: int) -> str:
+    """Return the name of the group of rings with a ring: rings 0 and 1 have few windows and form one group."""
+    return "0-1" if ring < 2 else str(ring)
+
+
+def name_source(side: str, ring: int) -> str:
+    """Return the source of the windows of a ring; those of the ceiling have no centre and thus one source."""
+    return side if side == CEILING else f"{side}-ring-{name_group(ring)}"
+
+
+def measure_reference_part(part: tuple[Shard, list[int]], number: int, root: str) -> tuple[list[dict], list[float]]:
+    """Measure scenes of the data as single windows, and write them as the source REFERENCE.
+
+    Args:
+        part: Shard and numbers of its rows.
+        number: Number of the part.
+        root: Dataset directory of the windows.
+
+    Returns:
+        Rows as in CityResult, and the height of the ground at the origin of each scene (m).
+    """
+    shard, chosen = part
+    scenes, rows = shard.scenes(chosen), []
+    for scene in scenes:
+        (values,) = measure_city(scene, CENTRE_M).quantities
+        rows.append(
+            {"side": REFERENCE, "city": scene.scene_id, "ahead": 0, "left": 0, "ring": 0}
+            | {"direction": DIRECTIONS[0], "kept": True}
+            | dict(zip(QUANTITIES, values.tolist(), strict=True))
+        )
+    Shard(root, REFERENCE, SPLIT, number).write([replace(s, source=REFERENCE, split=SPLIT) for s in scenes])
+    return rows, [find_origin_level_m(scene) for scene in scenes]
+
+
+def select_reference(
+    dataset: Dataset, split: str, label: tuple[str | None, str | None], limit: int
+) -> list[tuple[Shard, list[int]]]:
+    """Select evenly spaced scenes of the data that have a label; crops at any place if the dataset has such crops.
+
+    Args:
+        dataset: Dataset.
+        split: Split of the scenes.
+        label: Densities of vegetation and vehicles; None: any.
+        limit: Maximum number of scenes.
+
+    Returns:
+        Shards with row numbers.
+
+    Raises:
+        ValueError: No scene has the label.
+    """
+    found: list[tuple[Shard, int, bool]] = []
+    for shard, rows in SceneSubset(dataset.root, dataset.source, split).shards():
+        table = shard.read("scenes", ["vegetation_density", "vehicle_density", "free_pose"]).take(rows)
+        for row, (vegetation, vehicle, free) in zip(rows, zip(*table.to_pydict().values(), strict=True), strict=True):
+            if all(wanted in (None, own) for wanted, own in zip(label, (vegetation, vehicle), strict=True)):
+                found.append((shard, row, free))
+    if any(free for *_, free in found):
+        found = [entry for entry in found if entry[2]]
+    if not found:
+        raise ValueError(f"{dataset.root}: no scene of split {split} has the densities {label[0]}, {label[1]}")
+    parts: dict[Shard, list[int]] = {}
+    for at in select_evenly(len(found), min(limit, len(found))):
+        shard, row, _ = found[at]
+        parts.setdefault(shard, []).append(row)
+    return list(parts.items())
+
+
+def measure_cities(
+    jobs: Sequence[CityJob],
+    reference: list[tuple[Shard, list[int]]],
+    root: str,
+    dataset: Dataset,
+    num_tasks: int,
+    on_done: Callable[[str], None] = lambda name: None,
+) -> tuple[list[CityResult], list[dict]]:
+    """Measure the reference scenes and then all cities, in Ray tasks.
+
+    Args:
+        jobs: Cities.
+        reference: Selected scenes of the data (`select_reference`).
+        root: Dataset directory of the windows.
+        dataset: Dataset of the reference.
+        num_tasks: Maximum number of concurrent tasks.
+        on_done: Called with the name of the side after each city, and with REFERENCE after each part of the reference.
+
+    Returns:
+        Measures of the cities in the order of `jobs`, and the rows of the reference.
+    """
+
+    def measure_part(number: int) -> tuple[int, list[dict], list[float]]:
+        return number, *measure_reference_part(reference[number], number, root)
+
+    parts, levels = {}, []
+    for number, rows, levels_m in map_tasks(measure_part, range(len(reference)), READER_CPUS, num_tasks):
+        parts[number] = rows
+        levels += levels_m
+        on_done(REFERENCE)
+    level_m = float(np.nanmedian(levels))
+
+    def measure(number: int) -> tuple[int, CityResult]:
+        return number, measure_city_windows(jobs[number], root, dataset, level_m)
+
+    found = {}
+    for number, result in map_tasks(measure, range(len(jobs)), READER_CPUS, num_tasks):
+        found[number] = result
+        on_done(result.side)
+    return [found[number] for number in range(len(jobs))], [row for number in sorted(parts) for row in parts[number]]
+
+
+# ------------------------------------------------------------------------------------------------------ scores
+
+
+def compute_quantity_scores(rows: Sequence[dict]) -> dict[str, dict[str, Estimate | None]]:
+    """Estimate the mean of each quantity over windows, by group of rings.
+
+    Args:
+        rows: Rows of windows of one side; those that are not kept are left out.
+
+    Returns:
+        For each group of rings from the centre outwards, and for "all": estimates by QUANTITIES.
+    """
+    kept = [row for row in rows if row["kept"]]
+    groups: dict[str, list[dict]] = {}
+    for row in sorted(kept, key=lambda row: row["ring"]):
+        groups.setdefault(name_group(row["ring"]), []).append(row)
+    groups["all"] = kept
+    return {
+        group: dict(
+            zip(
+                QUANTITIES,
+                compute_scene_means(np.array([[row[name] for name in QUANTITIES] for row in chosen], float)),
+                strict=True,
+            )
+        )
+        for group, chosen in groups.items()
+        if chosen
+    }
+
+
+def compute_whole_scores(results: Sequence[CityResult], towns: Sequence[CityResult]) -> dict[str, Any]:
+    """Score cities as wholes: connectivity, blocks, street directions and seams.
+
+    Args:
+        results: Cities of one side.
+        towns: Cities of the ceiling, with whose streets those of `results` are compared. A town is not compared with
+            itself.
+
+    Returns:
+        Scores by name. Street distances and seams are nested by group of rings.
+    """
+    blocks_m2 = np.concatenate([result.blocks_m2 for result in results])
+    scores: dict[str, Any] = {
+        "cities": len(results),
+        "road_connectivity": compute_scene_means(np.array([[result.connectivity] for result in results]))[0],
+        "blocks_per_ha": len(blocks_m2) / sum(result.area_m2 for result in results) * HECTARE_M2,
+        "median_block_m2": float(np.median(blocks_m2)) if len(blocks_m2) else None,
+    }
+    towns_m = np.array([town.angles_m.sum(axis=0) for town in towns])
+    distances: dict[str, Any] = {}
+    seams: dict[str, Any] = {}
+    groups = dict.fromkeys(name_group(row["ring"]) for result in results for row in result.rows)
+    for group in (*groups, "all"):
+        of_group = [[group in (name_group(row["ring"]), "all") for row in result.rows] for result in results]
+        angles_m = np.array([r.angles_m[mask].sum(axis=0) for r, mask in zip(results, of_group, strict=True)])
+        found = compute_street_distances(angles_m, towns_m)
+        same = [[result.city == town.city for town in towns] for result in results]
+        found = np.where(same, np.nan, found)
+        known = np.isfinite(found)
+        per_city = np.divide(
+            np.where(known, found, 0).sum(axis=1),
+            known.sum(axis=1),
+            out=np.full(len(found), np.nan),
+            where=known.any(axis=1),
+        )
+        distances[group] = compute_scene_means(per_city[:, None])[0]
+        records = [
+            sum(
+                (record for ring, record in result.seams.items() if group in (name_group(ring), "all")),
+                np.zeros(RECORD),
+            )
+            for result in results
+        ]
+        if any(record.any() for record in records):
+            seams[group] = estimate_seam_ratios(np.array(records))
+    return scores | {"street_distance": distances, "seams": seams}
+
+
+def compute_street_distances(angles_m: np.ndarray, towns_m: np.ndarray) -> np.ndarray:
+    """Compute the Jensen-Shannon distance between the street directions of each city and each town.
+
+    Args:
+        angles_m: (n, 18) length of streets by direction in n cities.
+        towns_m: (k, 18) the same of k towns.
+
+    Returns:
+        (n, k) distances between 0 and 1 (base 2); NaN if a city or a town has no street.
+    """
+
+    def normalise(lengths: np.ndarray) -> np.ndarray:
+        with np.errstate(invalid="ignore"):
+            return lengths / lengths.sum(axis=1, keepdims=True)
+
+    return np.array(
+        [[jensenshannon(one, other, base=2) for other in normalise(towns_m)] for one in normalise(angles_m)]
+    ).reshape(len(angles_m), len(towns_m))

@@ -1,0 +1,102 @@
+"""Tests of the comparison of large scenes with data: seams of block grids, labels, levels, scores by ring and maps."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers import random_scene
+
+from models.composition.outpaint import BlockGrid
+from models.scene import VEGETATION, VEHICLES
+from pipelines.evaluation.cities import (
+    compute_quantity_scores,
+    compute_street_distances,
+    find_origin_level_m,
+    find_seams_m,
+    judge_label,
+    name_source,
+    read_seams_m,
+)
+from pipelines.generation.outpaint import RANKS
+from pipelines.metrics.cities import QUANTITIES
+from pipelines.reporting.city_report import CELL_PX, draw_map
+from pipelines.schema.density_labels import DensityThresholds
+
+
+def test_seams_lie_where_new_blocks_meet_known_content():
+    outward = BlockGrid.from_overlap(32, 0.5, rank=RANKS["outward"], num_blocks=(2, 1, 0, 1))
+    x_m, y_m = find_seams_m(outward, 2.0)
+    # Block 1 spans x from 32 to 96 m and meets known content at 64 m; block 2 at 96 m; block -1 at 0 m.
+    assert x_m == (0.0, 64.0, 96.0) and y_m == (-32.0,)
+    colours = BlockGrid.from_overlap(32, 0.25, rank=RANKS["colours"], num_blocks=(2, 0, 0, 0))
+    # Blocks 0 and 2 (x from 96 to 160 m) come first; block 1 (48 to 112 m) fills the gap between 64 and 96 m.
+    assert find_seams_m(colours, 2.0) == ((64.0, 96.0), ())
+    assert find_seams_m(BlockGrid(32, 16, num_blocks=(0, 0, 0, 0)), 2.0) == ((), ())
+
+
+def test_seams_are_read_from_the_record_of_a_run(tmp_path):
+    assert read_seams_m(str(tmp_path), "generated-city") == ((), ())
+    path = tmp_path / "generated-city.json"
+    path.write_text(json.dumps({"overlap": 0.5, "num_blocks": [1, 1, 1, 1], "order": "outward"}))
+    assert read_seams_m(str(tmp_path), "generated-city") == ((0.0, 64.0), (-32.0, 32.0))
+    path.write_text(json.dumps({"seed": 0}))
+    assert read_seams_m(str(tmp_path), "generated-city") == ((), ())
+
+
+def test_windows_of_the_first_rings_share_a_source():
+    assert [name_source("generated", ring) for ring in (0, 1, 2)] == [
+        "generated-ring-0-1",
+        "generated-ring-0-1",
+        "generated-ring-2",
+    ]
+    assert {name_source("ceiling", ring) for ring in range(4)} == {"ceiling"}
+
+
+def test_label_follows_thresholds_of_dataset():
+    scene = random_scene(0, n=40)
+    volume_m3 = scene.size_m.prod(axis=1)
+    plants = np.isin(scene.category, VEGETATION)
+    cars = np.isin(scene.category, VEHICLES)
+    assert plants.any() and cars.any()
+    above = DensityThresholds(*2 * (plants.sum() + 1.0,), *2 * (volume_m3[plants].sum() + 1,))
+    below = DensityThresholds(*2 * (cars.sum() - 1.0,), *2 * (volume_m3[cars].sum() - 0.01,))
+    assert judge_label(scene, SimpleNamespace(vegetation=above, vehicle=below)) == ("low", "high")
+
+
+def test_level_is_that_of_the_ground_next_to_the_origin():
+    scene = random_scene(1)
+    bare = np.zeros_like(scene.occupied)
+    level = scene.height_m * 0 + 7
+    level[:, -3, scene.grid.cols // 2 - 1 : scene.grid.cols // 2 + 1] = -2.5  # 2.5 pixels ahead of the origin.
+    occupied = bare.copy()
+    occupied[0, :-2] = True
+    changed = type(scene)(**{**vars(scene), "height_m": level, "occupied": occupied})
+    assert find_origin_level_m(changed) == -2.5
+    assert np.isnan(find_origin_level_m(type(scene)(**{**vars(scene), "occupied": bare})))
+
+
+def test_quantities_are_averaged_by_ring_over_kept_windows():
+    def row(ring, cars, kept=True):
+        return {name: 0.0 for name in QUANTITIES} | {"ring": ring, "kept": kept, "vehicle_small_per_ha": cars}
+
+    scores = compute_quantity_scores([row(2, 6.0), row(0, 1.0), row(1, 3.0), row(1, np.nan), row(2, 90.0, kept=False)])
+    means = {group: found["vehicle_small_per_ha"].value for group, found in scores.items()}
+    assert means == {"0-1": 2.0, "2": 6.0, "all": pytest.approx(10 / 3)}
+
+
+def test_street_distance_ranges_from_equal_to_disjoint():
+    along, across = np.zeros((2, 18))
+    along[0], across[9] = 5.0, 2.0
+    found = compute_street_distances(np.array([along, 3 * along, across * 0]), np.array([along, across]))
+    assert found[:2] == pytest.approx(np.array([[0, 1], [0, 1]]), abs=1e-6) and np.isnan(found[2]).all()
+
+
+def test_map_shows_ratio_to_expected_value():
+    picture = draw_map({(0, 0): 10.0, (1, 0): 40.0, (-1, 1): 1.0, (0, -1): float("nan")}, 10.0)
+    assert picture.shape == (3 * CELL_PX, 3 * CELL_PX, 3)
+    middle, ahead, behind_left, right = (
+        picture[row * CELL_PX + 3, col * CELL_PX + 3].astype(int) for row, col in ((1, 1), (0, 1), (2, 0), (1, 2))
+    )
+    assert (middle == 255).all() and ahead[0] > ahead[2] and behind_left[2] > behind_left[0]
+    assert len(set(right.tolist())) == 1 and right[0] < 255  # Grey: no value.
