@@ -53,7 +53,8 @@ def build_ring_table(scores: Mapping[str, Any]) -> Table:
     for name, meaning in MEANINGS.items():
         found = [find_score(scores["rings"][side][group], name) for _, side, group in columns]
         if any(value is not None for value in found):
-            rows.append((spell_name(name.split(".")[-1] if "." in name else name), *map(format_value, found)))
+            last = name.removesuffix(".generated").split(".")[-1]
+            rows.append((spell_name(last), *map(format_value, found)))
             meanings.append(meaning)
     note = (
         "Each column compares the same number of windows with the reference. The ceiling are windows of procedural"
