@@ -46,11 +46,12 @@ encode_latents --dataset @/datasets/town --lvae @/models/small-lvae
 train_dit smoke --dataset @/datasets/town --name small --steps 24 --num-workers 2
 sample_scenes --model @/models/pritti-small --num-scenes 24 --num-inference-steps 4 --run small --output @/small
 sample_scenes --model town --num-scenes 24 --sampler dpm++ --num-inference-steps 10 --run town --output @/town
-outpaint_scenes --model town --input @/town --guided --num-inference-steps 20
+outpaint_scenes --model town --input @/town --guided --num-inference-steps 8 --extent-m 192 192
 inpaint_scenes --model town --input @/town --half-plane 1 0 32 --guided --num-inference-steps 20 --output @/inpainted
 edit_scenes remove --category pole --input @/town --output @/edited
 evaluate_scenes --real @/datasets/town --generated @/town --run town --lvae @/models/small-lvae --lite0 False
 evaluate_seams --generated @/outpainted
+evaluate_city --generated @/outpainted --real @/datasets/town --label any-any --num-towns 2
 export_scenes --input @/town --max-scenes 4 --formats glb npz --output @/exports
 import_scenes @/exports/glb --name theirs --output @/imported
 evaluate_voxels --ground-truth @/exports/npz --reconstructed @/exports/npz --output @/voxels

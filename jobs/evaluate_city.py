@@ -1,21 +1,21 @@
 #!/usr/bin/env python3
-"""Compare large scenes with data, ring by ring from their centre.
+"""Score cities (large outpainted scenes) against real scenes, ring by ring from their first scene.
 
     jobs/evaluate_city.py --generated DIR --run city --real DIR
     jobs/evaluate_city.py --generated DIR --run city --control-run outward --real DIR --num-towns 8
 
 The job cuts each scene of jobs/outpaint_scenes.py into windows of 64 m. Ring 0 is the window of the first scene, ring 1
-are the eight windows around it, and so on. For each ring, the job compares the windows with real scenes of the same
-label: counts and ground shares per window, label fidelity, distances of distributions, and the classifier test. Street
-directions, junctions, blocks and seams are measured on the whole scene.
+consists of the eight windows around it, and so on. For each ring, the job compares the windows with real scenes of the
+same label: counts and ground shares per window, label fidelity, distances of distributions, and the two-sample test.
+Street directions, junctions, city blocks and seams are measured on the whole scene.
 
-The reference are scenes of --real with the label of the cities; crops at any place, if the dataset has such crops. The
-ceiling are windows of large procedural towns with the same label, cut in the same way. The control is another run, for
-example with another order of the blocks. Without --control-run, windows of the ceiling with moved objects take its
-place.
+The reference consists of scenes of --real with the label of the cities. If the dataset has crops at free poses, only
+these are used. The ceiling consists of windows of large procedural towns with the same label, cut in the same way. The
+control is another run, for example with another order of the blocks. Without --control-run, the control consists of
+windows of the ceiling with moved objects.
 
 The job writes metrics.json, metrics.parquet, windows.parquet (one row per window), the windows as scene tables and
-city.html, and logs the scores to MLflow. Run the same command again to resume after an interruption.
+city.html, and logs the scores to MLflow. An interrupted run starts again from the beginning.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ class Config:
     real_split: str = "test"
     """Split of the real scenes."""
     label: str = ""
-    """Densities of vegetation and vehicles of the reference and of the ceiling, such as low-medium or any-any (default:
-    the label of the cities)."""
+    """Density of vegetation, then of vehicles, of the reference and of the ceiling, such as low-medium; any-any selects
+    all scenes (default: the label of the cities)."""
     num_reference: int = 400
     """Maximum number of real scenes, selected evenly."""
     num_towns: int = 5
-    """Number of procedural towns of the ceiling."""
+    """Number of procedural towns of the ceiling, at least 2."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/city)."""
     if_busy: IfBusyOption = "refuse"

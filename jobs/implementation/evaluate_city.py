@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from typing import NamedTuple
 
 import pyarrow as pa
 from rich.console import Console
@@ -16,19 +17,20 @@ from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scores import publish_scores
 from models.labels import ANY
-from models.scene import DENSITIES
 from pipelines.evaluation.cities import (
     CEILING,
     REFERENCE,
     SPLIT,
     TOWN_SEEDS_START,
-    CityJob,
+    CityRequest,
     CityResult,
     compute_quantity_scores,
     compute_whole_scores,
     measure_cities,
     name_group,
     name_source,
+    parse_label,
+    read_label,
     read_seams_m,
     select_reference,
 )
@@ -45,6 +47,8 @@ from pipelines.schema.tables import Shard, find_shards
 GENERATED, CONTROL = "generated", "control"
 DAMAGE = "moved"  # Damage of the default control.
 ENOUGH_WINDOWS = 100
+MIN_WINDOWS = 6  # Scores with 3 neighbours need more than 3 windows.
+MIN_EXTENT_M = 192.0  # Rings 0 and 1.
 SHOWN = 2  # Number of overviews per side.
 
 Label = tuple[str | None, str | None]
@@ -60,15 +64,33 @@ def evaluate_city(config: Config) -> dict:
     output = resolve_path(config.output, "evaluations", "city")
     runs = {GENERATED: config.run} | ({CONTROL: config.control_run} if config.control_run else {})
     cities = {side: list_cities(generated, f"generated-{run}") for side, run in runs.items()}
-    label = parse_label(config.label) if config.label else find_label(cities[GENERATED])
+    labels = {side: find_label(generated, listed, config.label) for side, listed in cities.items()}
+    if len(set(labels.values())) > 1:
+        shown = " and ".join(f"{format_label(label)} ({runs[side]})" for side, label in labels.items())
+        raise ValueError(f"the runs have different labels, {shown}; compare runs with one label, or pass --label")
+    label = labels[GENERATED]
+    resolutions = {city.resolution_m for listed in cities.values() for city in listed}
+    if len(resolutions) > 1:
+        shown = ", ".join(f"{resolution_m:g} m" for resolution_m in sorted(resolutions))
+        raise ValueError(f"the cities have pixels of {shown}; compare cities with pixels of one size")
+    (resolution_m,) = resolutions
     reference = select_reference(dataset, config.real_split, label, config.num_reference)
-    extent_m = min(extent for *_, extent in cities[GENERATED])
+    extent_m = min(city.side_m for city in cities[GENERATED])
+    if extent_m < MIN_EXTENT_M:
+        raise ValueError(
+            f"a city of run {config.run} has a side of {extent_m:g} m, expected at least {MIN_EXTENT_M:g} m, which hold"
+            " rings 0 and 1; use outpaint_scenes.py --extent-m"
+        )
     jobs = [
-        CityJob(side, number, (shard, row), seams_m=read_seams_m(generated, shard.source))
+        CityRequest(
+            side, number, (city.shard, city.row), seams_m=read_seams_m(generated, city.shard.source), label=label
+        )
         for side, listed in cities.items()
-        for number, (shard, row, _) in enumerate(listed)
+        for number, city in enumerate(listed)
     ]
-    jobs += [CityJob(CEILING, k, (None, TOWN_SEEDS_START + k), extent_m, label=label) for k in range(config.num_towns)]
+    jobs += [
+        CityRequest(CEILING, k, (None, TOWN_SEEDS_START + k), extent_m, label=label) for k in range(config.num_towns)
+    ]
     with hold_output(output, "evaluation", config):
         root = storage.join_uri(output, "windows")
         storage.delete_directory(root)
@@ -78,7 +100,13 @@ def evaluate_city(config: Config) -> dict:
                 for side, total in {REFERENCE: len(reference), **Counter(job.side for job in jobs)}.items()
             }
             results, reference_rows = measure_cities(
-                jobs, reference, root, dataset, config.num_actors, lambda side: bar.advance(tasks[side])
+                jobs,
+                reference,
+                root,
+                dataset,
+                resolution_m,
+                config.num_actors,
+                lambda side: bar.advance(tasks[side]),
             )
             by_side: dict[str, list[CityResult]] = {}
             for result in results:
@@ -92,11 +120,6 @@ def evaluate_city(config: Config) -> dict:
             "quantities": {side: compute_quantity_scores(found) for side, found in rows.items()},
             "whole": {side: compute_whole_scores(found, by_side[CEILING]) for side, found in by_side.items()},
         }
-        for side, groups in rings.items():
-            whole = scores["whole"].get(side, {})
-            for group, found in groups.items():
-                found["street_distance"] = whole.get("street_distance", {}).get(group)
-                found["seams"] = whole.get("seams", {}).get(group, {})
         every = [row for found in rows.values() for row in found]
         storage.write_parquet(pa.Table.from_pylist(every), storage.join_uri(output, "windows.parquet"))
         tags = {"generated": generated, "real": dataset.root, "label": format_label(label)}
@@ -109,41 +132,49 @@ def evaluate_city(config: Config) -> dict:
         return nested
 
 
-def list_cities(root: str, source: str) -> list[tuple[Shard, int, float]]:
-    """List the large scenes of a source: shard, row and the shorter side (m)."""
+class City(NamedTuple):
+    """Place of a large scene in a dataset directory, its shorter side (m), the size of its pixels (m) and its label."""
+
+    shard: Shard
+    row: int
+    side_m: float
+    resolution_m: float
+    label: Label
+
+
+def list_cities(root: str, source: str) -> list[City]:
+    """List the large scenes of a source.
+
+    Raises:
+        ValueError: The source has no scene.
+    """
     found = []
     for shard in find_shards(root, "scenes", source, None):
-        for row, scene in enumerate(shard.scenes()):
-            side_m = min(scene.grid.rows, scene.grid.cols) * scene.grid.resolution_m
-            found.append((shard, row, side_m))
+        scenes = shard.read("scenes", ["vegetation_density", "vehicle_density"]).to_pylist()
+        rasters = shard.read("rasters", ["rows", "cols", "resolution_m"]).to_pylist()
+        for row, (scene, raster) in enumerate(zip(scenes, rasters, strict=True)):
+            side_m = min(raster["rows"], raster["cols"]) * raster["resolution_m"]
+            found.append(City(shard, row, side_m, raster["resolution_m"], tuple(scene.values())))
+    if not found:
+        raise ValueError(f"{root}: source {source} holds no scene")
     return found
 
 
-def find_label(cities: list[tuple[Shard, int, float]]) -> Label:
-    """Return the label that all cities have.
+def find_label(root: str, cities: list[City], option: str) -> Label:
+    """Return the requested label of all cities of a run: the option, that of the run's record, or that of the cities.
 
     Raises:
         ValueError: The cities have different labels.
     """
-    labels = set()
-    for shard, row, _ in cities:
-        table = shard.read("scenes", ["vegetation_density", "vehicle_density"])
-        labels.add(tuple(table[name][row].as_py() for name in table.column_names))
+    if option:
+        return parse_label(option)
+    if recorded := read_label(root, cities[0].shard.source):
+        return recorded
+    labels = {city.label for city in cities}
     if len(labels) > 1:
         shown = ", ".join(sorted(format_label(label) for label in labels))
         raise ValueError(f"the cities have the labels {shown}; evaluate one label at a time, or pass --label any-any")
     return labels.pop()
-
-
-def parse_label(text: str) -> Label:
-    """Return the densities of vegetation and vehicles that a label names."""
-    parts = [*text.split("-"), ANY][:2]
-    if unknown := set(parts) - {*DENSITIES, ANY}:
-        raise ValueError(
-            f"--label is {text!r}, expected densities such as low-medium or any-any, of {', '.join(DENSITIES)}, {ANY};"
-            f" {sorted(unknown)[0]!r} is unknown"
-        )
-    return tuple(None if part == ANY else part for part in parts)  # pyright: ignore[reportReturnType]
 
 
 def format_label(label: Label) -> str:
@@ -168,11 +199,15 @@ def score_rings(
     }
     sets[CEILING, "all"] = SceneSubset(root, CEILING, SPLIT)
     counts = {key: count_scenes(subset) for key, subset in sets.items()}
-    if not counts[CEILING, "all"]:
+    counts[REFERENCE, "all"] = len(rows[REFERENCE])
+    (side, group), count = min(counts.items(), key=lambda entry: entry[1])
+    if count < MIN_WINDOWS:
+        advice = {CEILING: "use more --num-towns", REFERENCE: "use a dataset with more scenes of the label"}
         raise ValueError(
-            f"no window of {config.num_towns} towns has the label; use more --num-towns, or --label any-any"
+            f"only {count} windows of the set {side}, ring {group}, expected at least {MIN_WINDOWS}:"
+            f" {advice.get(side, 'outpaint more scenes')}, or pass --label any-any"
         )
-    count = min(counts.values())
+    count = min(number for key, number in counts.items() if key[0] != REFERENCE)
     looks = FeatureConfig(lite0=prepare_lite0())
 
     def describe_set(subset: SceneSubset, name: str, control: str = "") -> dict:
@@ -206,18 +241,21 @@ def describe(
 ) -> list[str]:
     """Return the sentences of the page about the compared sets."""
     control = (
-        f"The control are {len(by_side[CONTROL])} scenes of run {config.control_run}."
+        f"The control consists of {len(by_side[CONTROL])} scenes of run {config.control_run}."
         if config.control_run
-        else f"The control are windows of the ceiling with damage: {CONTROLS[DAMAGE]}."
+        else f"The control consists of windows of the ceiling with damage: {CONTROLS[DAMAGE]}."
     )
     return [
         f"Cities: {len(by_side[GENERATED])} scenes of run {config.run}.",
         f"Reference: {len(reference_rows)} scenes of {dataset.root}, split {config.real_split}, label"
         f" {format_label(label)}; crops at any place if the dataset has such crops.",
-        f"Ceiling: windows with this label of {config.num_towns} procedural towns.",
+        f"Ceiling: windows of {config.num_towns} procedural towns with this label. They are selected by their measured"
+        " label, so their label fidelity is 1 and no ceiling.",
         control,
         f"Each set of windows has {count} windows. Windows are moved vertically, so that the ground at their origin is"
-        " as high as in the reference.",
+        " as high as in the reference. Intervals treat windows as independent. They are too narrow, because windows of"
+        " one city resemble each other.",
+        "Street directions, city blocks and connectivity use all windows of the towns, whatever their label.",
     ]
 
 

@@ -1,8 +1,8 @@
 """Compare the windows of large scenes with data, ring by ring, with Ray tasks.
 
 A city is cut into windows of the size of a scene (pipelines/metrics/cities.py). The windows of each group of rings are
-written as a source of a dataset directory, and scored like generated scenes against crops of the data. The ceiling are
-windows of large procedural towns, which have no centre.
+written as a source of a dataset directory, and scored like generated scenes against crops of the data. The ceiling
+consists of windows of large procedural towns, which have no centre.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ import numpy as np
 from scipy.spatial.distance import jensenshannon
 
 from models.composition.outpaint import BlockGrid
-from models.scene import VEGETATION, VEHICLES, Scene
+from models.labels import ANY, FREE
+from models.scene import DENSITIES, VEGETATION, VEHICLES, Grid, Scene
+from models.tensors import resample_scene_ground
 from pipelines.evaluation.evaluate import compute_scene_means
 from pipelines.evaluation.features import READER_CPUS
 from pipelines.generation.outpaint import RANKS
@@ -23,7 +25,7 @@ from pipelines.metrics.cities import (
     DIRECTIONS,
     HECTARE_M2,
     QUANTITIES,
-    RECORD,
+    SEAM_RECORD_SHAPE,
     WINDOW_M,
     measure_city,
     measure_seams_by_ring,
@@ -40,8 +42,9 @@ from pipelines.schema.density_labels import classify_density
 from pipelines.schema.scene_subset import SceneSubset, select_evenly
 from pipelines.schema.tables import Shard
 
-CENTRE_M = (WINDOW_M / 2, 0.0)  # Centre of the first scene of a city, in the frame of the city.
+CENTER_M = (WINDOW_M / 2, 0.0)  # Centre of the first scene of a city, in the frame of the city.
 SPLIT = "windows"
+FINE_CELLS = 1024  # A block in finer cells than those of any model, because records do not hold the size of the latent.
 OVERVIEW_PX = 768
 REFERENCE, CEILING = "reference", "ceiling"
 TOWN_SEEDS_START = 2_000_000  # Towns of the ceiling have other seeds than those of datasets.
@@ -56,7 +59,7 @@ class CityResult:
         city: Scene id.
         rows: One dictionary per window: ahead, left, ring, direction, kept and QUANTITIES.
         angles_m: (n, 18) length of centrelines by direction, per window (m).
-        blocks_m2: Areas of blocks (m^2).
+        city_blocks_m2: Areas of blocks (m^2).
         connectivity: Share of road pixels in the largest connected part.
         area_m2: Area of the city (m^2).
         seams: Record (4, 2, 2) of the seams of each ring; empty if no seams are known.
@@ -67,7 +70,7 @@ class CityResult:
     city: str
     rows: list[dict]
     angles_m: np.ndarray
-    blocks_m2: np.ndarray
+    city_blocks_m2: np.ndarray
     connectivity: float
     area_m2: float
     seams: dict[int, np.ndarray]
@@ -75,7 +78,7 @@ class CityResult:
 
 
 @dataclass(frozen=True)
-class CityJob:
+class CityRequest:
     """One large scene to measure.
 
     Attributes:
@@ -83,8 +86,9 @@ class CityJob:
         number: Number within the set.
         source: Shard and row of the scene, or (None, seed) for a procedural town.
         extent_m: Side of a procedural town (m).
-        seams_m: Positions of seams along x and y in the frame of the city (m).
-        label: Densities of vegetation and vehicles that a window must have; None: any.
+        seams_m: Positions of seams along x and y in the frame of the city (m). Positions outside the city are ignored.
+        label: Requested densities of vegetation and vehicles; None: any. Windows of a procedural town are kept only if
+            they have these densities.
     """
 
     side: str
@@ -122,13 +126,12 @@ def find_seams_m(block_grid: BlockGrid, cell_m: float) -> tuple[tuple[float, ...
     return found[0], tuple(y - WINDOW_M / 2 for y in found[1])
 
 
-def read_seams_m(root: str, source: str, size: int = 32) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def read_seams_m(root: str, source: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Read the positions of seams from the record of a run of jobs/outpaint_scenes.py.
 
     Args:
         root: Dataset directory.
         source: Source of the run, such as generated-outpainted.
-        size: Side of a block in latent cells.
 
     Returns:
         Positions along x and y (`find_seams_m`); none if there is no record.
@@ -140,9 +143,46 @@ def read_seams_m(root: str, source: str, size: int = 32) -> tuple[tuple[float, .
     if not {"overlap", "num_blocks", "order"} <= set(options):
         return (), ()
     grid = BlockGrid.from_overlap(
-        size, options["overlap"], rank=RANKS[options["order"]], num_blocks=tuple(options["num_blocks"])
+        FINE_CELLS, options["overlap"], rank=RANKS[options["order"]], num_blocks=tuple(options["num_blocks"])
     )
-    return find_seams_m(grid, WINDOW_M / size)
+    return find_seams_m(grid, WINDOW_M / FINE_CELLS)
+
+
+def read_label(root: str, source: str) -> tuple[str | None, str | None] | None:
+    """Read the requested label from the record of a run of jobs/outpaint_scenes.py.
+
+    Args:
+        root: Dataset directory.
+        source: Source of the run.
+
+    Returns:
+        Densities of vegetation and vehicles; None: there is no record, or the run took the label of each scene.
+    """
+    path = storage.join_uri(root, f"{source}.json")
+    label = storage.read_json(path).get("label") if storage.exists(path) else None
+    return parse_label(label) if label else None
+
+
+def parse_label(text: str) -> tuple[str | None, str | None]:
+    """Return the densities of vegetation and vehicles that a label names; None for a density that it does not name.
+
+    Args:
+        text: Label of any kind, such as low, low-medium or any-high-free.
+
+    Returns:
+        Densities of vegetation and vehicles.
+
+    Raises:
+        ValueError: A density is unknown.
+    """
+    parts = [*text.removesuffix(FREE).split("-"), ANY][:2]
+    if unknown := sorted(set(parts) - {*DENSITIES, ANY}):
+        raise ValueError(
+            f"label {text!r}: density {unknown[0]!r} is unknown, expected one of {', '.join(DENSITIES)}, {ANY}; write"
+            " the densities of vegetation and vehicles, such as low-medium or any-any"
+        )
+    vegetation, vehicle = (None if part == ANY else part for part in parts)
+    return vegetation, vehicle
 
 
 def find_origin_level_m(scene: Scene) -> float:
@@ -166,7 +206,9 @@ def judge_label(scene: Scene, dataset: Dataset) -> tuple[str, str]:
     return found[0], found[1]
 
 
-def measure_city_windows(job: CityJob, root: str, dataset: Dataset, level_m: float) -> CityResult:
+def measure_city_windows(
+    job: CityRequest, root: str, dataset: Dataset, level_m: float, resolution_m: float
+) -> CityResult:
     """Measure one city, and write its windows to a dataset directory, one source per ring.
 
     Args:
@@ -175,21 +217,21 @@ def measure_city_windows(job: CityJob, root: str, dataset: Dataset, level_m: flo
         dataset: Dataset with the thresholds of density labels.
         level_m: Height of the ground at the origin of the reference scenes; windows are moved vertically to this
             height (m).
+        resolution_m: Side of a pixel of a procedural town (m).
 
     Returns:
-        The measures.
+        Measures of the windows and of the whole city.
     """
     shard, row = job.source
-    city = shard.scenes([row])[0] if shard else make_large_scene(row, job.extent_m, dataset.spec.grid.resolution_m)
-    measured = measure_city(city, CENTRE_M)
+    city = shard.scenes([row])[0] if shard else make_large_scene(row, job.extent_m, resolution_m)
+    measured = measure_city(city, CENTER_M)
     windows: dict[str, list[Scene]] = {}
     rows = []
     for window, values in zip(measured.windows, measured.quantities, strict=True):
         scene, place = window.scene, (window.ahead * WINDOW_M, window.left * WINDOW_M)
-        label = judge_label(scene, dataset)
-        kept = all(wanted in (None, found) for wanted, found in zip(job.label, label, strict=True)) or bool(shard)
-        if shard is None:
-            scene = replace(scene, vegetation_density=label[0], vehicle_density=label[1])
+        judged = judge_label(scene, dataset)
+        kept = bool(shard) or all(wanted in (None, own) for wanted, own in zip(job.label, judged, strict=True))
+        vegetation, vehicle = job.label if shard else judged
         own_m = find_origin_level_m(scene)
         if np.isfinite(own_m):
             scene = scene.translate(0.0, 0.0, level_m - own_m)
@@ -197,6 +239,9 @@ def measure_city_windows(job: CityJob, root: str, dataset: Dataset, level_m: flo
         scene = replace(
             scene,
             scene_id=f"{job.side}-{job.number:04d}{window.ahead:+04d}{window.left:+04d}",
+            sequence=f"{job.side}-{job.number:04d}",
+            vegetation_density=vegetation,
+            vehicle_density=vehicle,
             world_xyz_m=(x_m + place[0], y_m + place[1], z_m),
         )
         rows.append(
@@ -212,17 +257,19 @@ def measure_city_windows(job: CityJob, root: str, dataset: Dataset, level_m: flo
     if any(job.seams_m):
         grid = city.grid
         lines = (
-            [round((edge - at_m) / grid.resolution_m) for at_m in places]
-            for edge, places in zip((grid.front_m, grid.left_m), job.seams_m, strict=True)
+            [line for at_m in places if 0 < (line := round((edge_m - at_m) / grid.resolution_m)) < count]
+            for edge_m, count, places in zip(
+                (grid.front_m, grid.left_m), (grid.rows, grid.cols), job.seams_m, strict=True
+            )
         )
-        seams = measure_seams_by_ring(city, *lines, center_m=CENTRE_M)
+        seams = measure_seams_by_ring(city, *lines, center_m=CENTER_M)
     area_m2 = city.grid.rows * city.grid.cols * city.grid.resolution_m**2
     return CityResult(
         job.side,
         city.scene_id,
         rows,
         measured.angles_m,
-        measured.blocks_m2,
+        measured.city_blocks_m2,
         measured.connectivity,
         area_m2,
         seams,
@@ -240,21 +287,38 @@ def name_source(side: str, ring: int) -> str:
     return side if side == CEILING else f"{side}-ring-{name_group(ring)}"
 
 
-def measure_reference_part(part: tuple[Shard, list[int]], number: int, root: str) -> tuple[list[dict], list[float]]:
+def measure_reference_part(
+    part: tuple[Shard, list[int]], number: int, root: str, resolution_m: float
+) -> tuple[list[dict], list[float]]:
     """Measure scenes of the data as single windows, and write them as the source REFERENCE.
 
     Args:
         part: Shard and numbers of its rows.
         number: Number of the part.
         root: Dataset directory of the windows.
+        resolution_m: Side of a pixel to which the ground is resampled (m).
 
     Returns:
         Rows as in CityResult, and the height of the ground at the origin of each scene (m).
+
+    Raises:
+        ValueError: A scene does not have the size of a window, or its pixels do not fit `resolution_m`.
     """
     shard, chosen = part
-    scenes, rows = shard.scenes(chosen), []
-    for scene in scenes:
-        (values,) = measure_city(scene, CENTRE_M).quantities
+    scenes, rows = [], []
+    pixels = round(WINDOW_M / resolution_m)
+    grid = Grid(WINDOW_M, WINDOW_M / 2, resolution_m, pixels, pixels)
+    for scene in shard.scenes(chosen):
+        try:
+            height_m, occupied = resample_scene_ground(scene, scene.ground_classes, grid)
+        except ValueError as error:
+            raise ValueError(
+                f"scene {scene.scene_id} of the reference does not fit windows of {WINDOW_M:g} m with pixels of"
+                f" {resolution_m:g} m: {error}"
+            ) from error
+        scene = replace(scene, grid=grid, height_m=height_m, occupied=occupied)
+        scenes.append(scene)
+        (values,) = measure_city(scene, CENTER_M).quantities
         rows.append(
             {"side": REFERENCE, "city": scene.scene_id, "ahead": 0, "left": 0, "ring": 0}
             | {"direction": DIRECTIONS[0], "kept": True}
@@ -299,10 +363,11 @@ def select_reference(
 
 
 def measure_cities(
-    jobs: Sequence[CityJob],
+    jobs: Sequence[CityRequest],
     reference: list[tuple[Shard, list[int]]],
     root: str,
     dataset: Dataset,
+    resolution_m: float,
     num_tasks: int,
     on_done: Callable[[str], None] = lambda name: None,
 ) -> tuple[list[CityResult], list[dict]]:
@@ -313,25 +378,31 @@ def measure_cities(
         reference: Selected scenes of the data (`select_reference`).
         root: Dataset directory of the windows.
         dataset: Dataset of the reference.
+        resolution_m: Side of a pixel of the cities, to which the reference and the towns are resampled (m).
         num_tasks: Maximum number of concurrent tasks.
         on_done: Called with the name of the side after each city, and with REFERENCE after each part of the reference.
 
     Returns:
         Measures of the cities in the order of `jobs`, and the rows of the reference.
+
+    Raises:
+        ValueError: No scene of the reference has ground.
     """
 
     def measure_part(number: int) -> tuple[int, list[dict], list[float]]:
-        return number, *measure_reference_part(reference[number], number, root)
+        return number, *measure_reference_part(reference[number], number, root, resolution_m)
 
     parts, levels = {}, []
     for number, rows, levels_m in map_tasks(measure_part, range(len(reference)), READER_CPUS, num_tasks):
         parts[number] = rows
         levels += levels_m
         on_done(REFERENCE)
+    if not np.isfinite(levels).any():
+        raise ValueError(f"{dataset.root}: none of {len(levels)} scenes of the reference has ground")
     level_m = float(np.nanmedian(levels))
 
     def measure(number: int) -> tuple[int, CityResult]:
-        return number, measure_city_windows(jobs[number], root, dataset, level_m)
+        return number, measure_city_windows(jobs[number], root, dataset, level_m, resolution_m)
 
     found = {}
     for number, result in map_tasks(measure, range(len(jobs)), READER_CPUS, num_tasks):
@@ -371,22 +442,22 @@ def compute_quantity_scores(rows: Sequence[dict]) -> dict[str, dict[str, Estimat
 
 
 def compute_whole_scores(results: Sequence[CityResult], towns: Sequence[CityResult]) -> dict[str, Any]:
-    """Score cities as wholes: connectivity, blocks, street directions and seams.
+    """Score cities as wholes: connectivity, city blocks, street directions and seams.
 
     Args:
         results: Cities of one side.
         towns: Cities of the ceiling, with whose streets those of `results` are compared. A town is not compared with
-            itself.
+            itself. Windows of all labels count.
 
     Returns:
         Scores by name. Street distances and seams are nested by group of rings.
     """
-    blocks_m2 = np.concatenate([result.blocks_m2 for result in results])
+    city_blocks_m2 = np.concatenate([result.city_blocks_m2 for result in results])
     scores: dict[str, Any] = {
         "cities": len(results),
         "road_connectivity": compute_scene_means(np.array([[result.connectivity] for result in results]))[0],
-        "blocks_per_ha": len(blocks_m2) / sum(result.area_m2 for result in results) * HECTARE_M2,
-        "median_block_m2": float(np.median(blocks_m2)) if len(blocks_m2) else None,
+        "city_blocks_per_ha": len(city_blocks_m2) / sum(result.area_m2 for result in results) * HECTARE_M2,
+        "median_city_block_m2": float(np.median(city_blocks_m2)) if len(city_blocks_m2) else None,
     }
     towns_m = np.array([town.angles_m.sum(axis=0) for town in towns])
     distances: dict[str, Any] = {}
@@ -409,7 +480,7 @@ def compute_whole_scores(results: Sequence[CityResult], towns: Sequence[CityResu
         records = [
             sum(
                 (record for ring, record in result.seams.items() if group in (name_group(ring), "all")),
-                np.zeros(RECORD),
+                np.zeros(SEAM_RECORD_SHAPE),
             )
             for result in results
         ]

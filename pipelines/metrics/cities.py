@@ -4,7 +4,8 @@ A window is a square with sides of WINDOW_M, the size of a scene that a model ge
 windows ahead of the first one and j windows to its left. The ring of a window is max(|i|, |j|): ring 0 is the first
 window, and ring 1 consists of the eight windows around it. Windows that reach beyond the scene are left out.
 
-Streets, junctions and blocks are measured on the whole scene, because the border of a window would cut them.
+Streets, junctions and city blocks are measured on the whole scene, because the border of a window would cut them. A
+city block is an area between roads, unlike a block of outpainting (glossary).
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
 
 from models.scene import CATEGORIES, GROUND_CLASSES, ROAD_CLASSES, Grid, Scene
 from pipelines.geometry.centerlines import RoadNetwork, extract_road_network
@@ -24,9 +24,10 @@ from pipelines.metrics.seams import FAR_M, MEASURES, NEAR_M, measure_scene_seams
 WINDOW_M = 64.0
 HECTARE_M2 = 10_000.0
 BORDER_M = 4.0  # A road that ends this close to the border of the scene continues outside.
-ANGLE_EDGES_DEG = np.linspace(0, 180, 19)
-MIN_BLOCK_M2 = 100.0  # Smaller areas between roads are traffic islands.
-RECORD = (len(MEASURES), 2, 2)  # Shape of a record of seams.
+# Streets along the axes lie in the middle of a bin, so that small deviations do not change their bin.
+ANGLE_EDGES_DEG = np.linspace(-5, 175, 19)
+MIN_CITY_BLOCK_M2 = 100.0  # Smaller areas between roads are traffic islands.
+SEAM_RECORD_SHAPE = (len(MEASURES), 2, 2)  # Shape of a record of seams.
 DIRECTIONS = ("centre", "ahead", "left", "behind", "right")
 
 QUANTITIES = (
@@ -81,14 +82,14 @@ class CityMeasurement:
         quantities: Values of QUANTITIES per window; NaN where a value is undefined.
         angles_m: Length of the road centrelines of each window by direction, in bins of ANGLE_EDGES_DEG (m). The
             direction is measured from the x axis of the city.
-        blocks_m2: Areas of the blocks: parts between roads that do not touch the border of the city (m^2).
+        city_blocks_m2: Areas of the city blocks: parts between roads that do not touch the border of the city (m^2).
         connectivity: Share of road pixels in the largest 4-connected part; NaN without road.
     """
 
     windows: list[Window]
     quantities: np.ndarray  # (n, len(QUANTITIES))
     angles_m: np.ndarray  # (n, 18)
-    blocks_m2: np.ndarray  # (b,)
+    city_blocks_m2: np.ndarray  # (b,)
     connectivity: float
 
 
@@ -139,7 +140,7 @@ def measure_city(city: Scene, center_m: tuple[float, float] | None = None) -> Ci
         center_m: Centre (x, y) of the first window (m, scene frame). None: centre of the scene.
 
     Returns:
-        The measures.
+        Quantities per window, and streets, city blocks and connectivity of the whole scene.
 
     Raises:
         ValueError: No window fits into the scene (`list_window_grids`).
@@ -167,7 +168,7 @@ def measure_city(city: Scene, center_m: tuple[float, float] | None = None) -> Ci
         windows,
         np.array(rows),
         np.array(angles),
-        measure_blocks_m2(roads, city.grid.resolution_m),
+        measure_city_blocks_m2(roads, city.grid.resolution_m),
         _measure_connectivity(roads),
     )
 
@@ -180,11 +181,12 @@ def _measure_window(scene: Scene, height_m: np.ndarray, classes: np.ndarray, str
     down_m, right_m = np.diff(height_m, axis=0), np.diff(height_m, axis=1)
     both_down, both_right = known[1:] & known[:-1], known[:, 1:] & known[:, :-1]
     corner = both_down[:, :-1] & both_right[:-1]  # Pixels with ground below and to the right.
-    heights = [np.nan] * 3
+    slope = step_m = np.nan
     if corner.any():
         steps_m = np.concatenate([np.abs(down_m[both_down]), np.abs(right_m[both_right])])
         slope = np.hypot(down_m[:, :-1][corner], right_m[:-1][corner]).mean() / scene.grid.resolution_m
-        heights = [slope, np.quantile(steps_m, 0.99), height_m[known].mean()]
+        step_m = np.quantile(steps_m, 0.99)
+    heights = [slope, step_m, height_m[known].mean() if known.any() else np.nan]
     per_hectare = np.array(streets) / hectares
     return [*(scene.counts() / hectares), *shares, known.mean(), *per_hectare, *heights]
 
@@ -216,28 +218,28 @@ def _split_roads(network: RoadNetwork) -> tuple[np.ndarray, np.ndarray, np.ndarr
     first = np.concatenate([np.zeros((0, 2)), *(line[:-1] for line in lines_m)])
     last = np.concatenate([np.zeros((0, 2)), *(line[1:] for line in lines_m)])
     step_m = last - first
-    angle_deg = np.degrees(np.arctan2(step_m[:, 1], step_m[:, 0])) % 180
+    angle_deg = (np.degrees(np.arctan2(step_m[:, 1], step_m[:, 0])) + 5) % 180 - 5
     bins = np.digitize(angle_deg, ANGLE_EDGES_DEG[1:-1])
     return (first + last) / 2, np.linalg.norm(step_m, axis=1), bins
 
 
-def measure_blocks_m2(roads: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Measure the blocks between roads.
+def measure_city_blocks_m2(roads: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Measure the city blocks.
 
     Args:
         roads: (H, W) bool; True for each pixel of a road.
         resolution_m: Side of a pixel (m).
 
     Returns:
-        Areas (b,) of the 4-connected parts without road that do not touch the border and have at least MIN_BLOCK_M2
-        (m^2).
+        Areas (b,) of the 4-connected parts without road that do not touch the border and have at least
+        MIN_CITY_BLOCK_M2 (m^2).
     """
-    parts, _ = ndimage.label(~roads)
+    parts, _ = label_parts(~roads)
     border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
     areas_m2 = np.bincount(parts.ravel()) * resolution_m**2
     areas_m2[border] = 0
     areas_m2[0] = 0  # Roads.
-    return areas_m2[areas_m2 >= MIN_BLOCK_M2]
+    return areas_m2[areas_m2 >= MIN_CITY_BLOCK_M2]
 
 
 def _measure_connectivity(roads: np.ndarray) -> float:
@@ -297,6 +299,6 @@ def measure_seams_by_ring(
                 others = [other - low for other in lines if low < other < high and other != line]
                 here = ([line - low], (), others) if axis == 0 else ((), [line - low], (), others)
                 along_px, across_px = start + side / 2 - origin_px[1 - axis], line - origin_px[axis]
-                ring = round(max(abs(along_px), abs(across_px)) / side)
-                found[ring] = found.get(ring, np.zeros(RECORD)) + measure_scene_seams(strip, *here)
+                ring = int(max(abs(along_px), abs(across_px)) / side + 0.5)  # A border belongs to the outer ring.
+                found[ring] = found.get(ring, np.zeros(SEAM_RECORD_SHAPE)) + measure_scene_seams(strip, *here)
     return found

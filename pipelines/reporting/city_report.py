@@ -16,9 +16,11 @@ from pipelines.reporting.evaluation_report import format_value
 from pipelines.reporting.report import Charts, Picture, Pictures, Section, Table, Text, render_report_html
 
 CELL_PX = 56
+LEVEL_M = 5.0  # Difference of the level of the ground at which the colour of a map is fullest (m).
+EPSILON = 1e-6  # Added to values before their ratio, so that a value expected to be 0 is red.
 FEW_COLOR, MANY_COLOR = np.array([49, 104, 180]), np.array([190, 60, 40])  # A quarter or less; four times or more.
 MEANINGS = {
-    "two_sample_auc": "a classifier tells windows from data; .5: it cannot",
+    "two_sample_auc": "AUC of a classifier that separates windows from real scenes; 0.5 is perfect",
     "relation_frechet": "distance of relations between objects and ground",
     "lite0_frechet": "distance of features of EfficientNet-Lite0",
     "lite0_coverage_k3": "share of real scenes with a window in their neighbourhood",
@@ -26,17 +28,20 @@ MEANINGS = {
     "label_fidelity.vehicle_fidelity": "share of windows with the requested density of vehicles",
     "validity.overlapping.generated": "share of solid objects that overlap another by a quarter",
     "validity.unattached.generated": "share of signs, lamps and poles without support",
-    "street_distance": "Jensen-Shannon distance of street directions from towns",
-    "seams.class_changes": "class changes at seams, relative to nearby lines",
-    "seams.height_step": "height steps at seams, relative to nearby lines",
-    "seams.cut_objects": "cut objects at seams, relative to nearby lines",
+}
+WHOLE_MEANINGS = {
+    "street_distance": "mean Jensen-Shannon distance (base 2) between the street directions of a city and of each town",
+    "seams.class_changes": "rate of class changes at seams divided by that at nearby lines",
+    "seams.height_step": "height steps at seams divided by those at nearby lines",
+    "seams.cut_objects": "rate of cut objects at seams divided by that at nearby lines",
+    "seams.doubled_objects": "rate of doubled objects at seams divided by that at nearby lines",
 }
 
 
-def find_score(scores: Mapping[str, Any], name: str) -> Any:
-    """Return a nested score by its name with dots; None if it is absent."""
-    for part in name.split("."):
-        scores = scores.get(part) if scores else None  # pyright: ignore[reportAssignmentType]
+def find_score(scores: Any, name: str) -> Any:
+    """Return a nested score by its name with dots; None if it is absent. The empty name returns `scores`."""
+    for part in name.split(".") if name else ():
+        scores = scores.get(part) if scores else None
     return scores
 
 
@@ -57,8 +62,9 @@ def build_ring_table(scores: Mapping[str, Any]) -> Table:
             rows.append((spell_name(last), *map(format_value, found)))
             meanings.append(meaning)
     note = (
-        "Each column compares the same number of windows with the reference. The ceiling are windows of procedural"
-        " towns. Brackets contain 95 % bootstrap intervals."
+        "Each column compares the same number of windows with the reference. The ceiling consists of windows of"
+        " procedural towns. They are selected by their label, so their label fidelity is no ceiling. Brackets contain"
+        " 95 % bootstrap intervals over windows."
     )
     return Table("Scores by ring", ("score", *(heading for heading, *_ in columns)), rows, meanings, note)
 
@@ -74,27 +80,50 @@ def build_quantity_table(scores: Mapping[str, Any]) -> Table:
         rows.append((spell_name(name), *map(format_value, found)))
     headings = [heading for heading, *_ in columns]
     note = (
-        "Reference: scenes of the data with the same label; the borders of a scene cut streets, so compare junctions,"
-        " dead ends and road lengths with the ceiling."
+        "Reference: scenes of the data with the same label. Each of them is measured alone, so its border cuts streets."
+        " Therefore compare junctions, dead ends and road lengths with the ceiling."
     )
     ends = [side for side in ("ceiling", "reference") if side in quantities]
     return Table("Quantities by ring", ("quantity", *headings, *ends), rows, note=note)
 
 
+def build_street_table(scores: Mapping[str, Any]) -> Table:
+    """Build the table of street directions and seams by ring. They use all windows of a ring."""
+    columns = [
+        (f"{side}, ring {group}", side, group)
+        for side, whole in scores["whole"].items()
+        for group in whole["street_distance"]
+    ]
+    rows, meanings = [], []
+    for name, meaning in WHOLE_MEANINGS.items():
+        first, *rest = name.split(".")
+        found = [find_score(scores["whole"][side][first].get(group), ".".join(rest)) for _, side, group in columns]
+        if any(value is not None for value in found):
+            rows.append((spell_name(name.split(".")[-1]), *map(format_value, found)))
+            meanings.append(meaning)
+    note = (
+        "The ceiling compares towns with each other. Distances between few streets are larger, so compare equal rings."
+        " A ratio of 1 means that seams are invisible."
+    )
+    return Table("Streets and seams by ring", ("score", *(heading for heading, *_ in columns)), rows, meanings, note)
+
+
 def build_whole_table(scores: Mapping[str, Any]) -> Table:
     """Build the table of the scores of whole cities."""
     sides = list(scores["whole"])
-    names = ("cities", "road_connectivity", "blocks_per_ha", "median_block_m2")
+    names = ("cities", "road_connectivity", "city_blocks_per_ha", "median_city_block_m2")
     rows = [(spell_name(name), *(format_value(scores["whole"][side][name]) for side in sides)) for name in names]
     return Table("Whole cities", ("quantity", *sides), rows)
 
 
-def draw_map(values: Mapping[tuple[int, int], float], expected: float) -> np.ndarray:
-    """Draw the mean value of each window; colours show the ratio to an expected value.
+def draw_map(values: Mapping[tuple[int, int], float], expected: float, difference: float | None = None) -> np.ndarray:
+    """Draw the mean value of each window; colours show how it differs from an expected value.
 
     Args:
-        values: Value by (windows ahead, windows to the left).
-        expected: Value at which a window is white; blue windows have less and red ones more.
+        values: Value by (windows ahead, windows to the left). Windows without a value are grey.
+        expected: Value at which a window is white; blue windows have less and red ones more. NaN: all are grey.
+        difference: Difference from `expected` at which the colours are fullest. None: they are fullest at a quarter
+            and at four times `expected`.
 
     Returns:
         (h, w, 3) uint8 picture; ahead is up and left is left.
@@ -106,9 +135,12 @@ def draw_map(values: Mapping[tuple[int, int], float], expected: float) -> np.nda
     for (ahead, left), value in values.items():
         x, y = (reach - left) * CELL_PX, (reach - ahead) * CELL_PX
         color = (238, 238, 238)
-        if np.isfinite(value):
-            both = max(abs(expected), 1e-9)
-            strength = np.clip(np.log(max(value, 1e-9) / both) / np.log(4), -1, 1) if expected > 0 else 0.0
+        if np.isfinite(value) and np.isfinite(expected):
+            if difference is None:
+                strength = np.log((value + EPSILON) / (expected + EPSILON)) / np.log(4)
+            else:
+                strength = (value - expected) / difference
+            strength = float(np.clip(strength, -1, 1))
             goal = MANY_COLOR if strength > 0 else FEW_COLOR
             color = tuple(int(c) for c in 255 + abs(strength) * (goal - 255))
         draw.rectangle((x, y, x + CELL_PX - 2, y + CELL_PX - 2), fill=color)
@@ -127,13 +159,13 @@ def draw_maps(rows: Sequence[Mapping[str, Any]], expected: Mapping[str, float]) 
             place: float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
             for place, values in found.items()
         }
-        goal = expected.get(name, float("nan"))
+        goal = expected[name]
         caption = f"{spell_name(name)}; expected: {format_number(goal) if np.isfinite(goal) else '–'}"
-        pictures.append(Picture(caption, draw_map(means, goal if np.isfinite(goal) else 0.0)))
+        pictures.append(Picture(caption, draw_map(means, goal, LEVEL_M if name == "level_m" else None)))
     note = (
         f"Each square is a window of {WINDOW_M:g} m and shows the mean over cities; ahead is up. White: as expected."
-        " Blue: a quarter or less. Red: four times or more. Street quantities are compared with the ceiling, others"
-        " with the reference."
+        f" Blue: a quarter or less (level: {LEVEL_M:g} m less). Red: four times or more (level: {LEVEL_M:g} m more)."
+        " Street quantities are compared with the ceiling, others with the reference."
     )
     return Pictures("Maps", pictures, 3, note)
 
@@ -145,13 +177,17 @@ def draw_ring_charts(scores: Mapping[str, Any]) -> Charts:
         series = {}
         for side, groups in scores["quantities"].items():
             if side not in ("reference", "ceiling"):
-                known = [(k, groups[g][name]["value"]) for k, g in enumerate(g for g in groups if g != "all")]
+                known = [
+                    (0.5 if group == "0-1" else float(group), found[name]["value"])
+                    for group, found in groups.items()
+                    if group != "all" and found[name]
+                ]
                 series[side] = tuple(map(list, zip(*known, strict=True))) if known else ([], [])
         last = max((max(x) for x, _ in series.values() if x), default=0)
         for side in ("ceiling", "reference"):
             value = scores["quantities"][side]["all"][name]["value"]
             series[side] = ([0, max(last, 1)], [value, value])
-        charts.append(Chart(spell_name(name), series, "group of rings, from the centre", spell_name(name)))
+        charts.append(Chart(spell_name(name), series, "ring (0.5: rings 0 and 1)", spell_name(name)))
     return Charts("Rings", charts)
 
 
@@ -181,6 +217,7 @@ def render_city_html(
     sections: list[Section] = [
         build_ring_table(scores),
         draw_ring_charts(scores),
+        build_street_table(scores),
         build_quantity_table(scores),
         build_whole_table(scores),
         Pictures("Cities from above", overviews, 2),

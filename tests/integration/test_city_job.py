@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jobs.evaluate_city import Config
-from jobs.implementation.evaluate_city import evaluate_city, parse_label
+from jobs.implementation.evaluate_city import evaluate_city
 from jobs.implementation.preprocess_scenes import main as preprocess
 from jobs.preprocess_scenes import Town
 from models.scene import CATEGORY_INDEX
@@ -62,7 +62,7 @@ def test_towns_score_like_towns_and_damaged_ones_worse(real, tmp_path):
     }
     assert frechet["generated"] < 1.5 * frechet["ceiling"] and frechet["control"] > 1.5 * frechet["ceiling"]
     whole = scores["whole"]["generated"]
-    assert whole["road_connectivity"]["value"] > 0.99 and whole["blocks_per_ha"] > 0.5
+    assert whole["road_connectivity"]["value"] > 0.99 and whole["city_blocks_per_ha"] > 0.5
     assert 0 < whole["street_distance"]["all"]["value"] < 0.6
     assert set(whole["seams"]["all"]) == {"class_changes", "height_step", "cut_objects", "doubled_objects"}
     assert 0.7 < whole["seams"]["all"]["class_changes"]["value"] < 1.4  # A town has no seams there.
@@ -73,11 +73,19 @@ def test_towns_score_like_towns_and_damaged_ones_worse(real, tmp_path):
     assert counted["generated"][0] == 18 and 0.1 < counted["reference"][1] < 0.35
 
 
-def test_labels_of_cities_are_checked(real, tmp_path):
-    assert parse_label("low-any") == ("low", None) and parse_label("high") == ("high", None)
-    with pytest.raises(ValueError, match="'lots' is unknown"):
-        parse_label("lots-any")
+def test_unsuitable_cities_are_refused(real, tmp_path):
     with pytest.raises(ValueError, match="expected at least 2"):
         evaluate_city(Config(real=real, num_towns=1))
-    with pytest.raises(ValueError, match="generated-none"):
+    with pytest.raises(ValueError, match="holds no scenes"):
         evaluate_city(Config(generated=str(tmp_path), run="none", real=real))
+    small = replace(make_large_scene(500, 128.0), source="generated-small", split="generated")
+    Shard(str(tmp_path), "generated-small", "generated", 0).write([small])
+    with pytest.raises(ValueError, match=r"side of 128 m, expected at least 192 m, which hold rings 0 and 1"):
+        evaluate_city(Config(generated=str(tmp_path), run="small", real=real, label="any-any"))
+    for number, density in enumerate(("low", "high")):
+        city = replace(small, scene_id=f"mixed-{number}", source="generated-mixed", vegetation_density=density)
+        Shard(str(tmp_path), "generated-mixed", "generated", number).write([city])
+    with pytest.raises(ValueError, match="cities have the labels high-any, low-any"):
+        evaluate_city(Config(generated=str(tmp_path), run="mixed", real=real))
+    with pytest.raises(ValueError, match="density 'lots' is unknown"):
+        evaluate_city(Config(generated=str(tmp_path), run="mixed", real=real, label="lots-any"))

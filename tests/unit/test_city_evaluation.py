@@ -16,6 +16,8 @@ from pipelines.evaluation.cities import (
     find_seams_m,
     judge_label,
     name_source,
+    parse_label,
+    read_label,
     read_seams_m,
 )
 from pipelines.generation.outpaint import RANKS
@@ -42,6 +44,15 @@ def test_seams_are_read_from_the_record_of_a_run(tmp_path):
     assert read_seams_m(str(tmp_path), "generated-city") == ((0.0, 64.0), (-32.0, 32.0))
     path.write_text(json.dumps({"seed": 0}))
     assert read_seams_m(str(tmp_path), "generated-city") == ((), ())
+
+
+def test_label_is_read_from_the_record_of_a_run(tmp_path):
+    assert read_label(str(tmp_path), "generated-city") is None
+    for text, label in {"low": ("low", None), "any-high-free": (None, "high"), None: None}.items():
+        (tmp_path / "generated-city.json").write_text(json.dumps({"label": text}))
+        assert read_label(str(tmp_path), "generated-city") == label
+    with pytest.raises(ValueError, match="density 'lots' is unknown, expected one of low, medium, high, any"):
+        parse_label("lots-any")
 
 
 def test_windows_of_the_first_rings_share_a_source():
@@ -100,3 +111,5 @@ def test_map_shows_ratio_to_expected_value():
     )
     assert (middle == 255).all() and ahead[0] > ahead[2] and behind_left[2] > behind_left[0]
     assert len(set(right.tolist())) == 1 and right[0] < 255  # Grey: no value.
+    assert draw_map({(0, 0): 0.3}, 0.0)[3, 3].argmax() == 0  # Red: nothing is expected.
+    assert draw_map({(0, 0): -4.0}, -1.0, difference=5.0)[3, 3].argmax() == 2
