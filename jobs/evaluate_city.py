@@ -7,7 +7,7 @@
 The job cuts each scene of jobs/outpaint_scenes.py into windows of 64 m. Ring 0 is the window of the first scene, ring 1
 consists of the eight windows around it, and so on. For each ring, the job compares the windows with real scenes of the
 same label: counts and ground shares per window, label fidelity, distances of distributions, and the two-sample test.
-Street directions, junctions, city blocks and seams are measured on the whole scene.
+Street directions, junctions, city blocks, traffic and seams are measured on the whole scene.
 
 The reference consists of scenes of --real with the label of the cities. If the dataset has crops at free poses, only
 these are used. The ceiling consists of windows of large procedural towns with the same label, cut in the same way. The
@@ -45,6 +45,8 @@ class Config:
     """Maximum number of real scenes, selected evenly."""
     num_towns: int = 5
     """Number of procedural towns of the ceiling, at least 2."""
+    traffic: bool = True
+    """Simulate traffic on the streets with SUMO, if it is installed (extra traffic or $SUMO_HOME)."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/city)."""
     if_busy: IfBusyOption = "refuse"

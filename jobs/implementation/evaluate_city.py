@@ -36,6 +36,7 @@ from pipelines.evaluation.cities import (
 )
 from pipelines.evaluation.evaluate import compare_datasets
 from pipelines.evaluation.features import FeatureConfig, compute_scene_features, count_scenes
+from pipelines.evaluation.traffic import find_sumo
 from pipelines.metrics.controls import CONTROLS
 from pipelines.reporting.city_report import build_ring_table, render_city_html
 from pipelines.reporting.report import Picture
@@ -74,6 +75,7 @@ def evaluate_city(config: Config) -> dict:
         shown = ", ".join(f"{resolution_m:g} m" for resolution_m in sorted(resolutions))
         raise ValueError(f"the cities have pixels of {shown}; compare cities with pixels of one size")
     (resolution_m,) = resolutions
+    traffic = config.traffic and find_sumo() is not None
     reference = select_reference(dataset, config.real_split, label, config.num_reference)
     extent_m = min(city.side_m for city in cities[GENERATED])
     if extent_m < MIN_EXTENT_M:
@@ -83,13 +85,19 @@ def evaluate_city(config: Config) -> dict:
         )
     jobs = [
         CityRequest(
-            side, number, (city.shard, city.row), seams_m=read_seams_m(generated, city.shard.source), label=label
+            side,
+            number,
+            (city.shard, city.row),
+            seams_m=read_seams_m(generated, city.shard.source),
+            traffic=traffic,
+            label=label,
         )
         for side, listed in cities.items()
         for number, city in enumerate(listed)
     ]
     jobs += [
-        CityRequest(CEILING, k, (None, TOWN_SEEDS_START + k), extent_m, label=label) for k in range(config.num_towns)
+        CityRequest(CEILING, k, (None, TOWN_SEEDS_START + k), extent_m, traffic=traffic, label=label)
+        for k in range(config.num_towns)
     ]
     with hold_output(output, "evaluation", config):
         root = storage.join_uri(output, "windows")

@@ -20,6 +20,7 @@ from models.scene import DENSITIES, VEGETATION, VEHICLES, Grid, Scene
 from models.tensors import resample_scene_ground
 from pipelines.evaluation.evaluate import compute_scene_means
 from pipelines.evaluation.features import READER_CPUS
+from pipelines.evaluation.traffic import Traffic, simulate_traffic
 from pipelines.generation.outpaint import RANKS
 from pipelines.metrics.cities import (
     DIRECTIONS,
@@ -64,6 +65,7 @@ class CityResult:
         area_m2: Area of the city (m^2).
         seams: Record (4, 2, 2) of the seams of each ring; empty if no seams are known.
         overview: (h, w, 3) uint8 picture of the city from above.
+        traffic: Result of a simulation of traffic; None without simulation or without roads.
     """
 
     side: str
@@ -75,6 +77,7 @@ class CityResult:
     area_m2: float
     seams: dict[int, np.ndarray]
     overview: np.ndarray
+    traffic: Traffic | None
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,7 @@ class CityRequest:
         source: Shard and row of the scene, or (None, seed) for a procedural town.
         extent_m: Side of a procedural town (m).
         seams_m: Positions of seams along x and y in the frame of the city (m). Positions outside the city are ignored.
+        traffic: Whether to simulate traffic with SUMO.
         label: Requested densities of vegetation and vehicles; None: any. Windows of a procedural town are kept only if
             they have these densities.
     """
@@ -96,6 +100,7 @@ class CityRequest:
     source: tuple[Shard | None, int]
     extent_m: float = 0.0
     seams_m: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+    traffic: bool = False
     label: tuple[str | None, str | None] = (None, None)
 
 
@@ -274,6 +279,7 @@ def measure_city_windows(
         area_m2,
         seams,
         render_bev(city, OVERVIEW_PX),
+        simulate_traffic(city) if job.traffic and np.isfinite(measured.connectivity) else None,
     )
 
 
@@ -459,6 +465,9 @@ def compute_whole_scores(results: Sequence[CityResult], towns: Sequence[CityResu
         "city_blocks_per_ha": len(city_blocks_m2) / sum(result.area_m2 for result in results) * HECTARE_M2,
         "median_city_block_m2": float(np.median(city_blocks_m2)) if len(city_blocks_m2) else None,
     }
+    if simulated := [result.traffic for result in results if result.traffic]:
+        shares = np.array([[found.routed / found.requested, found.arrived_share] for found in simulated])
+        scores["vehicles_routed"], scores["vehicles_arrived"] = compute_scene_means(shares)
     towns_m = np.array([town.angles_m.sum(axis=0) for town in towns])
     distances: dict[str, Any] = {}
     seams: dict[str, Any] = {}

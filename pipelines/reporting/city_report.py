@@ -29,6 +29,14 @@ MEANINGS = {
     "validity.overlapping.generated": "share of solid objects that overlap another by a quarter",
     "validity.unattached.generated": "share of signs, lamps and poles without support",
 }
+CITY_QUANTITIES = {
+    "cities": "number of cities",
+    "road_connectivity": "share of road pixels in the largest connected part",
+    "city_blocks_per_ha": "city blocks per hectare that do not touch the border",
+    "median_city_block_m2": "median area of these city blocks (m²)",
+    "vehicles_routed": "share of simulated vehicles with a way to a random street (SUMO)",
+    "vehicles_arrived": "share of these vehicles that arrive within 15 minutes",
+}
 WHOLE_MEANINGS = {
     "street_distance": "mean Jensen-Shannon distance (base 2) between the street directions of a city and of each town",
     "seams.class_changes": "rate of class changes at seams divided by that at nearby lines",
@@ -111,9 +119,11 @@ def build_street_table(scores: Mapping[str, Any]) -> Table:
 def build_whole_table(scores: Mapping[str, Any]) -> Table:
     """Build the table of the scores of whole cities."""
     sides = list(scores["whole"])
-    names = ("cities", "road_connectivity", "city_blocks_per_ha", "median_city_block_m2")
-    rows = [(spell_name(name), *(format_value(scores["whole"][side][name]) for side in sides)) for name in names]
-    return Table("Whole cities", ("quantity", *sides), rows)
+    rows = [
+        (spell_name(name), *(format_value(scores["whole"][side].get(name)) for side in sides))
+        for name in CITY_QUANTITIES
+    ]
+    return Table("Whole cities", ("quantity", *sides), rows, list(CITY_QUANTITIES.values()))
 
 
 def draw_map(values: Mapping[tuple[int, int], float], expected: float, difference: float | None = None) -> np.ndarray:
