@@ -36,7 +36,7 @@ JOB_TIMEOUT_S = 900
 SHOWN = 2  # Number of lines of each output.
 WIDTH = 112
 OTHERS = re.compile(  # Lines of Ray and MLflow, bars of progress and tables.
-    r"\(|\d{4}-\d\d-\d\d |[-=]{5}|Job |Next steps|Query|Ask|Tailing|Running entrypoint|🧪|🏃|.*\d+%\||[│└┗╰ ]"
+    r"\(|\d{4}-\d\d-\d\d |[-=]{5}|Job |Next steps|Query|Ask|Tailing|Running entrypoint|🧪|🏃|.*\d+%\||[│└┗╰┏┡┃ ]"
 )
 # @ is the home directory.
 JOBS = """

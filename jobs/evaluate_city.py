@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Score cities (large outpainted scenes) against real scenes, ring by ring from their first scene.
+"""Score cities, that is, large outpainted scenes, ring by ring against real scenes.
 
     jobs/evaluate_city.py --generated DIR --run city --real DIR
     jobs/evaluate_city.py --generated DIR --run city --control-run outward --real DIR --num-towns 8

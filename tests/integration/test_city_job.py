@@ -49,6 +49,7 @@ def test_towns_score_like_towns_and_damaged_ones_worse(real, tmp_path):
         control_run="bare",
         real=real,
         num_towns=2,
+        traffic=False,  # tests/unit/test_traffic.py runs SUMO.
         output=str(tmp_path / "city"),
     )
     scores = evaluate_city(config)

@@ -10,8 +10,10 @@ from helpers import random_scene
 from models.composition.outpaint import BlockGrid
 from models.scene import VEGETATION, VEHICLES
 from pipelines.evaluation.cities import (
+    CityResult,
     compute_quantity_scores,
     compute_street_distances,
+    compute_whole_scores,
     find_origin_level_m,
     find_seams_m,
     judge_label,
@@ -20,8 +22,9 @@ from pipelines.evaluation.cities import (
     read_label,
     read_seams_m,
 )
+from pipelines.evaluation.traffic import Traffic
 from pipelines.generation.outpaint import RANKS
-from pipelines.metrics.cities import QUANTITIES
+from pipelines.metrics.cities import QUANTITIES, SEAM_RECORD_SHAPE
 from pipelines.reporting.city_report import CELL_PX, draw_map
 from pipelines.schema.density_labels import DensityThresholds
 
@@ -94,6 +97,29 @@ def test_quantities_are_averaged_by_ring_over_kept_windows():
     scores = compute_quantity_scores([row(2, 6.0), row(0, 1.0), row(1, 3.0), row(1, np.nan), row(2, 90.0, kept=False)])
     means = {group: found["vehicle_small_per_ha"].value for group, found in scores.items()}
     assert means == {"0-1": 2.0, "2": 6.0, "all": pytest.approx(10 / 3)}
+
+
+def test_whole_cities_are_scored_by_blocks_traffic_and_seams():
+    def make(city, angles_m, traffic=None, seams=None):
+        rows = [{"ring": 0}, {"ring": 2}]
+        blocks_m2 = np.array([2000.0, 3000.0, 7000.0])
+        overview = np.zeros((2, 2, 3), np.uint8)
+        return CityResult("side", city, rows, angles_m, blocks_m2, 0.9, 20_000.0, seams or {}, overview, traffic)
+
+    along, across = np.zeros((2, 2, 18))
+    along[:, 0] = across[:, 9] = 50.0
+    record = np.zeros(SEAM_RECORD_SHAPE)
+    record[..., 1] = 10.0
+    record[0, :, 0] = 6.0, 3.0  # Twice as many class changes at the seam.
+    one = make("one", along, Traffic(100, 80, 60), {2: record})
+    other = make("other", across, Traffic(100, 100, 100), {2: record})
+    scores = compute_whole_scores([one, other], [one, other])
+    assert scores["city_blocks_per_ha"] == pytest.approx(1.5) and scores["median_city_block_m2"] == 3000.0
+    assert scores["vehicles_routed"].value == pytest.approx(0.9)
+    assert scores["vehicles_arrived"].value == pytest.approx((0.75 + 1) / 2)
+    assert scores["street_distance"]["2"].value == pytest.approx(1)  # A town is not compared with itself.
+    assert set(scores["seams"]) == {"2", "all"}
+    assert scores["seams"]["2"]["class_changes"].value == pytest.approx(2)
 
 
 def test_street_distance_ranges_from_equal_to_disjoint():
