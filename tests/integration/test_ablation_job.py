@@ -66,6 +66,7 @@ def test_encoding_study_writes_table_and_figure_and_resumes(empty_home, capsys):
         compare_encodings(Encoding(train_sizes=(64,), num_seeds=1, epochs=2, num_test_boxes=300))
 
 
+@pytest.mark.slow  # Builds every variant of the study.
 def test_variant_differs_from_preset_only_in_its_switch(empty_home):
     from jobs.ablate_lvae import Augmentation, Branches, Decoders, Detr
     from jobs.implementation.ablate_lvae import prepare_variant

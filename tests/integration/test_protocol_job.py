@@ -72,6 +72,7 @@ def test_paper_fid_streams_all_training_scenes(data, tmp_path):
         evaluate(replace(base, controls=True, output=str(tmp_path / "c")))
 
 
+@pytest.mark.slow  # Describes all scenes with VGG16.
 def test_paper_nearest_computes_only_distances_of_vgg16(data, tmp_path, monkeypatch):
     """All generated pictures are copies of training scenes; the test split is not used."""
     weights = str(tmp_path / "vgg16.safetensors")
