@@ -24,14 +24,14 @@ from pipelines.evaluation.cities import (
     TOWN_SEEDS_START,
     CityRequest,
     CityResult,
+    RunRecord,
     compute_quantity_scores,
     compute_whole_scores,
     measure_cities,
     name_group,
     name_source,
     parse_label,
-    read_label,
-    read_seams_m,
+    read_run_record,
     select_reference,
 )
 from pipelines.evaluation.evaluate import compare_datasets
@@ -65,7 +65,8 @@ def evaluate_city(config: Config) -> dict:
     output = resolve_path(config.output, "evaluations", "city")
     runs = {GENERATED: config.run} | ({CONTROL: config.control_run} if config.control_run else {})
     cities = {side: list_cities(generated, f"generated-{run}") for side, run in runs.items()}
-    labels = {side: find_label(generated, listed, config.label) for side, listed in cities.items()}
+    records = {side: read_run_record(generated, f"generated-{run}") for side, run in runs.items()}
+    labels = {side: find_label(listed, records[side], config.label) for side, listed in cities.items()}
     if len(set(labels.values())) > 1:
         shown = " and ".join(f"{format_label(label)} ({runs[side]})" for side, label in labels.items())
         raise ValueError(f"the runs have different labels, {shown}; compare runs with one label, or pass --label")
@@ -88,7 +89,7 @@ def evaluate_city(config: Config) -> dict:
             side,
             number,
             (city.shard, city.row),
-            seams_m=read_seams_m(generated, city.shard.source),
+            seams_m=records[side].seams_m,
             traffic=traffic,
             label=label,
         )
@@ -168,7 +169,7 @@ def list_cities(root: str, source: str) -> list[City]:
     return found
 
 
-def find_label(root: str, cities: list[City], option: str) -> Label:
+def find_label(cities: list[City], record: RunRecord, option: str) -> Label:
     """Return the requested label of all cities of a run: the option, that of the run's record, or that of the cities.
 
     Raises:
@@ -176,8 +177,8 @@ def find_label(root: str, cities: list[City], option: str) -> Label:
     """
     if option:
         return parse_label(option)
-    if recorded := read_label(root, cities[0].shard.source):
-        return recorded
+    if record.label:
+        return record.label
     labels = {city.label for city in cities}
     if len(labels) > 1:
         shown = ", ".join(sorted(format_label(label) for label in labels))
@@ -257,13 +258,14 @@ def describe(
         f"Cities: {len(by_side[GENERATED])} scenes of run {config.run}.",
         f"Reference: {len(reference_rows)} scenes of {dataset.root}, split {config.real_split}, label"
         f" {format_label(label)}; crops at any place if the dataset has such crops.",
-        f"Ceiling: windows of {config.num_towns} procedural towns with this label. They are selected by their measured"
-        " label, so their label fidelity is 1 and no ceiling.",
+        f"Ceiling: windows of {config.num_towns} procedural towns (version 2) with this label. They are selected by"
+        " their measured label, so their label fidelity is 1 and no ceiling.",
         control,
         f"Each set of windows has {count} windows. Windows are moved vertically, so that the ground at their origin is"
         " as high as in the reference. Intervals treat windows as independent. They are too narrow, because windows of"
         " one city resemble each other.",
         "Street directions, city blocks and connectivity use all windows of the towns, whatever their label.",
+        *([] if find_sumo() else ["Traffic was not simulated, because SUMO is not installed (extra traffic)."]),
     ]
 
 

@@ -9,37 +9,37 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import jensenshannon
 
 from models.composition.outpaint import BlockGrid
 from models.labels import ANY, FREE
-from models.scene import DENSITIES, VEGETATION, VEHICLES, Grid, Scene
+from models.scene import DENSITIES, Grid, Scene
 from models.tensors import resample_scene_ground
 from pipelines.evaluation.evaluate import compute_scene_means
 from pipelines.evaluation.features import READER_CPUS
 from pipelines.evaluation.traffic import Traffic, simulate_traffic
 from pipelines.generation.outpaint import RANKS
 from pipelines.metrics.cities import (
-    DIRECTIONS,
     HECTARE_M2,
     QUANTITIES,
     SEAM_RECORD_SHAPE,
     WINDOW_M,
+    Window,
     measure_city,
     measure_seams_by_ring,
 )
 from pipelines.metrics.intervals import Estimate
 from pipelines.metrics.relations import fuse_ground
 from pipelines.metrics.seams import estimate_seam_ratios
+from pipelines.metrics.validity import judge_densities
 from pipelines.preprocess.sources.town.version2.town import make_large_scene
 from pipelines.rendering.render import render_bev
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_tasks
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.density_labels import classify_density
 from pipelines.schema.scene_subset import SceneSubset, select_evenly
 from pipelines.schema.tables import Shard
 
@@ -131,41 +131,37 @@ def find_seams_m(block_grid: BlockGrid, cell_m: float) -> tuple[tuple[float, ...
     return found[0], tuple(y - WINDOW_M / 2 for y in found[1])
 
 
-def read_seams_m(root: str, source: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Read the positions of seams from the record of a run of jobs/outpaint_scenes.py.
+class RunRecord(NamedTuple):
+    """What the record of a run of jobs/outpaint_scenes.py says about its cities.
+
+    Attributes:
+        label: Requested densities of vegetation and vehicles; None: unknown, or the run took the label of each scene.
+        seams_m: Positions of seams along x and y (`find_seams_m`); none if they are unknown.
+    """
+
+    label: tuple[str | None, str | None] | None = None
+    seams_m: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+
+
+def read_run_record(root: str, source: str) -> RunRecord:
+    """Read the record of a run of jobs/outpaint_scenes.py.
 
     Args:
         root: Dataset directory.
         source: Source of the run, such as generated-outpainted.
 
     Returns:
-        Positions along x and y (`find_seams_m`); none if there is no record.
+        Label and seams; nothing is known without a record.
     """
     path = storage.join_uri(root, f"{source}.json")
-    if not storage.exists(path):
-        return (), ()
-    options = storage.read_json(path)
+    options = storage.read_json(path) if storage.exists(path) else {}
+    label = parse_label(options["label"]) if options.get("label") else None
     if not {"overlap", "num_blocks", "order"} <= set(options):
-        return (), ()
+        return RunRecord(label)
     grid = BlockGrid.from_overlap(
         FINE_CELLS, options["overlap"], rank=RANKS[options["order"]], num_blocks=tuple(options["num_blocks"])
     )
-    return find_seams_m(grid, WINDOW_M / FINE_CELLS)
-
-
-def read_label(root: str, source: str) -> tuple[str | None, str | None] | None:
-    """Read the requested label from the record of a run of jobs/outpaint_scenes.py.
-
-    Args:
-        root: Dataset directory.
-        source: Source of the run.
-
-    Returns:
-        Densities of vegetation and vehicles; None: there is no record, or the run took the label of each scene.
-    """
-    path = storage.join_uri(root, f"{source}.json")
-    label = storage.read_json(path).get("label") if storage.exists(path) else None
-    return parse_label(label) if label else None
+    return RunRecord(label, find_seams_m(grid, WINDOW_M / FINE_CELLS))
 
 
 def parse_label(text: str) -> tuple[str | None, str | None]:
@@ -201,16 +197,6 @@ def find_origin_level_m(scene: Scene) -> float:
     return float(height_m[rows[nearest], cols[nearest]])
 
 
-def judge_label(scene: Scene, dataset: Dataset) -> tuple[str, str]:
-    """Return the densities of vegetation and vehicles of a scene by the thresholds of a dataset."""
-    volume_m3 = scene.size_m.prod(axis=1) if len(scene) else np.zeros(0)
-    found = []
-    for group, thresholds in ((VEGETATION, dataset.vegetation), (VEHICLES, dataset.vehicle)):
-        among = np.isin(scene.category, group)
-        found.append(str(classify_density(among.sum(), volume_m3[among].sum(), thresholds)))
-    return found[0], found[1]
-
-
 def measure_city_windows(
     job: CityRequest, root: str, dataset: Dataset, level_m: float, resolution_m: float
 ) -> CityResult:
@@ -234,7 +220,7 @@ def measure_city_windows(
     rows = []
     for window, values in zip(measured.windows, measured.quantities, strict=True):
         scene, place = window.scene, (window.ahead * WINDOW_M, window.left * WINDOW_M)
-        judged = judge_label(scene, dataset)
+        judged = judge_densities(scene, dataset.vegetation, dataset.vehicle)
         kept = bool(shard) or all(wanted in (None, own) for wanted, own in zip(job.label, judged, strict=True))
         vegetation, vehicle = job.label if shard else judged
         own_m = find_origin_level_m(scene)
@@ -249,11 +235,7 @@ def measure_city_windows(
             vehicle_density=vehicle,
             world_xyz_m=(x_m + place[0], y_m + place[1], z_m),
         )
-        rows.append(
-            {"side": job.side, "city": city.scene_id, "ahead": window.ahead, "left": window.left}
-            | {"ring": window.ring, "direction": window.direction, "kept": kept}
-            | dict(zip(QUANTITIES, values.tolist(), strict=True))
-        )
+        rows.append(_make_row(job.side, city, window, values, kept))
         if kept:
             windows.setdefault(name_source(job.side, window.ring), []).append(scene)
     for source, scenes in windows.items():
@@ -281,6 +263,19 @@ def measure_city_windows(
         render_bev(city, OVERVIEW_PX),
         simulate_traffic(city) if job.traffic and np.isfinite(measured.connectivity) else None,
     )
+
+
+def _make_row(side: str, city: Scene, window: Window, values: np.ndarray, kept: bool = True) -> dict[str, Any]:
+    """Return the row of a window in windows.parquet."""
+    return {
+        "side": side,
+        "city": city.scene_id,
+        "ahead": window.ahead,
+        "left": window.left,
+        "ring": window.ring,
+        "direction": window.direction,
+        "kept": kept,
+    } | dict(zip(QUANTITIES, values.tolist(), strict=True))
 
 
 def name_group(ring: int) -> str:
@@ -324,12 +319,8 @@ def measure_reference_part(
             ) from error
         scene = replace(scene, grid=grid, height_m=height_m, occupied=occupied)
         scenes.append(scene)
-        (values,) = measure_city(scene, CENTER_M).quantities
-        rows.append(
-            {"side": REFERENCE, "city": scene.scene_id, "ahead": 0, "left": 0, "ring": 0}
-            | {"direction": DIRECTIONS[0], "kept": True}
-            | dict(zip(QUANTITIES, values.tolist(), strict=True))
-        )
+        measured = measure_city(scene, CENTER_M)
+        rows.append(_make_row(REFERENCE, scene, measured.windows[0], measured.quantities[0]))
     Shard(root, REFERENCE, SPLIT, number).write([replace(s, source=REFERENCE, split=SPLIT) for s in scenes])
     return rows, [find_origin_level_m(scene) for scene in scenes]
 

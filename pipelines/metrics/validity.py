@@ -180,6 +180,24 @@ def sum_validity(by_category: np.ndarray, connectivity: np.ndarray) -> np.ndarra
     return np.concatenate([by_category.sum(axis=1), connectivity[None]])
 
 
+def judge_densities(scene: Scene, vegetation: DensityThresholds, vehicle: DensityThresholds) -> tuple[str, str]:
+    """Return the densities of vegetation and vehicles that a scene has by the thresholds of a dataset.
+
+    Args:
+        scene: Scene.
+        vegetation: Thresholds of the vegetation density.
+        vehicle: Thresholds of the vehicle density.
+
+    Returns:
+        Density of the vegetation, then of the vehicles.
+    """
+    found = []
+    for categories, thresholds in ((VEGETATION, vegetation), (VEHICLES, vehicle)):
+        members = np.isin(scene.category, categories)
+        found.append(str(classify_density(members.sum(), scene.volume_m3[members].sum(), thresholds)))
+    return found[0], found[1]
+
+
 def compute_label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle: DensityThresholds) -> np.ndarray:
     """Compare the density of a scene with the requested density label.
 
@@ -200,13 +218,9 @@ def compute_label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle:
         raise ValueError(f"scene {scene.scene_id} has no density label; label fidelity needs the requested label")
     right: list[bool | None] = []
     by_label: list[bool | None] = []
-    for categories, thresholds, label in (
-        (VEGETATION, vegetation, scene.vegetation_density),
-        (VEHICLES, vehicle, scene.vehicle_density),
-    ):
-        members = np.isin(scene.category, categories)
-        own = classify_density(members.sum(), scene.volume_m3[members].sum(), thresholds)
-        right.append(None if label is None else bool(own == label))
+    requested = scene.vegetation_density, scene.vehicle_density
+    for own, label in zip(judge_densities(scene, vegetation, vehicle), requested, strict=True):
+        right.append(None if label is None else own == label)
         by_label += [right[-1] if label == one else None for one in DENSITIES]
     right.append(None if None in right else all(right))
     right += by_label

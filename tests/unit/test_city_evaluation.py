@@ -1,7 +1,6 @@
 """Tests of the comparison of large scenes with data: seams of block grids, labels, levels, scores by ring and maps."""
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,15 +15,14 @@ from pipelines.evaluation.cities import (
     compute_whole_scores,
     find_origin_level_m,
     find_seams_m,
-    judge_label,
     name_source,
     parse_label,
-    read_label,
-    read_seams_m,
+    read_run_record,
 )
 from pipelines.evaluation.traffic import Traffic
 from pipelines.generation.outpaint import RANKS
 from pipelines.metrics.cities import QUANTITIES, SEAM_RECORD_SHAPE
+from pipelines.metrics.validity import judge_densities
 from pipelines.reporting.city_report import CELL_PX, draw_map
 from pipelines.schema.density_labels import DensityThresholds
 
@@ -41,19 +39,19 @@ def test_seams_lie_where_new_blocks_meet_known_content():
 
 
 def test_seams_are_read_from_the_record_of_a_run(tmp_path):
-    assert read_seams_m(str(tmp_path), "generated-city") == ((), ())
+    assert read_run_record(str(tmp_path), "generated-city").seams_m == ((), ())
     path = tmp_path / "generated-city.json"
     path.write_text(json.dumps({"overlap": 0.5, "num_blocks": [1, 1, 1, 1], "order": "outward"}))
-    assert read_seams_m(str(tmp_path), "generated-city") == ((0.0, 64.0), (-32.0, 32.0))
+    assert read_run_record(str(tmp_path), "generated-city").seams_m == ((0.0, 64.0), (-32.0, 32.0))
     path.write_text(json.dumps({"seed": 0}))
-    assert read_seams_m(str(tmp_path), "generated-city") == ((), ())
+    assert read_run_record(str(tmp_path), "generated-city").seams_m == ((), ())
 
 
 def test_label_is_read_from_the_record_of_a_run(tmp_path):
-    assert read_label(str(tmp_path), "generated-city") is None
+    assert read_run_record(str(tmp_path), "generated-city").label is None
     for text, label in {"low": ("low", None), "any-high-free": (None, "high"), None: None}.items():
         (tmp_path / "generated-city.json").write_text(json.dumps({"label": text}))
-        assert read_label(str(tmp_path), "generated-city") == label
+        assert read_run_record(str(tmp_path), "generated-city").label == label
     with pytest.raises(ValueError, match="density 'lots' is unknown, expected one of low, medium, high, any"):
         parse_label("lots-any")
 
@@ -75,7 +73,7 @@ def test_label_follows_thresholds_of_dataset():
     assert plants.any() and cars.any()
     above = DensityThresholds(*2 * (plants.sum() + 1.0,), *2 * (volume_m3[plants].sum() + 1,))
     below = DensityThresholds(*2 * (cars.sum() - 1.0,), *2 * (volume_m3[cars].sum() - 0.01,))
-    assert judge_label(scene, SimpleNamespace(vegetation=above, vehicle=below)) == ("low", "high")
+    assert judge_densities(scene, above, below) == ("low", "high")
 
 
 def test_level_is_that_of_the_ground_next_to_the_origin():
