@@ -36,14 +36,14 @@ class Town:
     """Number of test scenes, which come from separate towns."""
     seed: int = 0
     """Random seed."""
-    town_version: Literal[1, 2] = 1
+    town_version: Literal[1, 2] = 2
     """Version of the town. Version 2 is nearer to real streets (docs/experiments/town2.md)."""
     free_pose_share: float | None = None
     """Share of the scenes that are crops at any place and heading, instead of views of a vehicle (default: 0.25 for
     version 2, 0 for version 1)."""
-    slots: Literal["p95", "p99.5", "paper"] = "p95"
+    slots: Literal["p95", "p99.5", "paper"] | None = None
     """Rule for the number of slots per category: a percentile over the training split, or the paper's 514 slots in
-    total. Models do not learn objects beyond these slots."""
+    total. Models do not learn objects beyond these slots (default: p99.5 for version 2, p95 for version 1)."""
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,8 @@ def make_recorded_options(config: Town | Kitti360 | Av2 | Own) -> dict:
     if isinstance(config, Town):
         # Datasets of version 1 do not record the share, as in earlier versions of this job.
         share = {"free_pose_share": find_free_pose_share(config)} if config.town_version > 1 else {}
-        return {name: value for name, value in options.items() if name != "free_pose_share"} | share
+        slots = config.slots or ("p99.5" if config.town_version > 1 else "p95")
+        return {name: value for name, value in options.items() if name != "free_pose_share"} | share | {"slots": slots}
     return options | {"input": make_absolute(config.input)}
 
 

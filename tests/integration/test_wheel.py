@@ -17,7 +17,7 @@ from pritti import PrITTIPipeline
 
 for package in (jobs, models, pipelines, pritti):
     assert package.__file__.startswith({site!r}), package.__file__
-(scene,) = PrITTIPipeline.from_pretrained("town").generate(["low"], seed=0, num_inference_steps=2)
+(scene,) = PrITTIPipeline.from_pretrained("town").generate(["low-medium"], seed=0, num_inference_steps=2)
 print(len(scene), "primitives")
 """
 PACKAGES = ("pritti", "models", "pipelines", "jobs")

@@ -175,7 +175,7 @@ def test_pipeline_attaches_by_default():
     pipeline = PrITTIPipeline.from_pretrained("town")
     pipeline.set_progress_bar_config(disable=True)
     pipeline.use_sampler("dpm++")
-    labels = ["low", "medium", "high", "low"]
+    labels = ["low-low", "medium-medium", "high-low", "low-high"]
     latents = pipeline.sample_latents(labels, 0, range(4), 10)
     identities = [pipeline.new_identity("run", 0, k, label) for k, label in enumerate(labels)]
     plain = pipeline.decode(latents, identities, attach=False)

@@ -417,7 +417,7 @@ def test_constraints_improve_scenes_of_released_weights():
     latents = {}
     for constraints in (False, True):
         pipeline.use_constraints(constraints)
-        latents[constraints] = pipeline.sample_latents(["low", "medium"], 5, range(2), 20)
+        latents[constraints] = pipeline.sample_latents(["low-medium", "medium-low"], 5, range(2), 20)
     plain, guided = (require_guidance(pipeline).measure_penalties(latents[key]) for key in (False, True))
     assert sum_all(guided) < 0.5 * sum_all(plain)
     for name in ("penetration", "height"):

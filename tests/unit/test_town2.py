@@ -237,21 +237,21 @@ def test_free_pose_column_round_trips(towns, tmp_path):
 
 
 def test_town_job_records_version_and_share():
-    old = make_recorded_options(Town(num_train=5))
-    assert old["town_version"] == 1 and "free_pose_share" not in old
-    new = make_recorded_options(Town(num_train=5, town_version=2))
-    assert (new["town_version"], new["free_pose_share"]) == (2, 0.25)
-    assert make_recorded_options(Town(town_version=2, free_pose_share=0.0))["free_pose_share"] == 0.0
-    keys = [part.key for task in plan_shards(Town(num_train=40, num_test=0, town_version=2)) for part in task.parts]
+    old = make_recorded_options(Town(num_train=5, town_version=1))
+    assert (old["town_version"], old["slots"]) == (1, "p95") and "free_pose_share" not in old
+    new = make_recorded_options(Town(num_train=5))
+    assert (new["town_version"], new["slots"], new["free_pose_share"]) == (2, "p99.5", 0.25)
+    assert make_recorded_options(Town(free_pose_share=0.0))["free_pose_share"] == 0.0
+    keys = [part.key for task in plan_shards(Town(num_train=40, num_test=0)) for part in task.parts]
     assert {version for _, _, version, _ in keys} == {2} and sum(free for *_, free in keys) == 10
 
 
 def test_town_job_refuses_wrong_share():
     with pytest.raises(ValueError, match=r"--free-pose-share is 1\.5, expected a share between 0 and 1"):
-        check_preprocess_scenes(Town(town_version=2, free_pose_share=1.5))
+        check_preprocess_scenes(Town(free_pose_share=1.5))
     with pytest.raises(ValueError, match="add --town-version 2"):
-        check_preprocess_scenes(Town(free_pose_share=0.5))
-    check_preprocess_scenes(Town(free_pose_share=0.0))
+        check_preprocess_scenes(Town(town_version=1, free_pose_share=0.5))
+    check_preprocess_scenes(Town(town_version=1, free_pose_share=0.0))
 
 
 @pytest.mark.parametrize("seed", range(40, 52))

@@ -44,7 +44,7 @@ __all__ = [
     "write_kitti360",
 ]
 
-TOWN_VERSION = 1  # Default version.
+TOWN_VERSION = 1  # Default version of `generate_town`; that of the job is 2.
 TOWN_VERSIONS = (1, 2)
 TRAIN_SEEDS_START = 0
 TEST_SEEDS_START = 1_000_000
