@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Publish a trained and evaluated pipeline in the model zoo and in MLflow.
 
-    jobs/sample_scenes.py --num-scenes 1000 --run judged --sampler dpm++ --num-inference-steps 20
+    jobs/sample_scenes.py --num-scenes 1000 --run judged --sampler sde-dpm++ --num-inference-steps 20
     jobs/evaluate_scenes.py --real-split test --run judged --lvae DIR/lvae
     jobs/publish_model.py --name town --evaluation $PRITTI_HOME/evaluations/judged
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
@@ -125,7 +126,7 @@ class ModelCard:
         )
         yield (
             f"![First scenes without selection](samples.png)\n\n*First scenes of seed {self.sampling['seed']}, without "
-            f"selection. Labels alternate: {', '.join(self.sampling['labels'])}. Sampler {self.sampling['sampler']}, "
+            f"selection. {self._describe_labels()} Sampler {self.sampling['sampler']}, "
             f"{self.sampling['num_inference_steps']} steps, guidance scale {self.sampling['guidance_scale']:g}, "
             f"PAG scale {self.sampling.get('pag_scale', 0):g}, "
             f"{'with' if self.sampling.get('constraints') else 'without'} constraints, "
@@ -133,6 +134,14 @@ class ModelCard:
             f"{self.sampling.get('existence_threshold', EXISTENCE_THRESHOLD):g}.*\n"
         )
         yield f"Condition: {self.label} ({', '.join(self.labels)}).\n"
+
+    def _describe_labels(self) -> str:
+        """Return the sequence of labels of the judged scenes, or how often each label occurs if there are many."""
+        labels = self.sampling["labels"]
+        if len(labels) <= len(self.labels):
+            return f"Labels alternate: {', '.join(labels)}."
+        shares = ", ".join(f"{label} ({count})" for label, count in Counter(labels).most_common())
+        return f"{len(labels)} labels alternate: {shares}."
 
     def _training(self) -> Iterator[str]:
         scenes = ", ".join(f"{count:,} {split}" for split, count in sorted(self.dataset["scenes"].items()))

@@ -39,7 +39,7 @@ class SamplingRequest(StudioRequest):
 
 
 class GenerateRequest(SamplingRequest):
-    sampler: Literal["ddpm", "ddim", "dpm++", "sde-dpm++"] = "dpm++"
+    sampler: Literal["ddpm", "ddim", "dpm++", "sde-dpm++"] = "sde-dpm++"
 
 
 class RepaintRequest(SamplingRequest):
