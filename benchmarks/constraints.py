@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 from common import describe_machine
 
-from models.labels import LABELS
+from models.labels import list_usual_labels
 from models.pipeline import PrITTIPipeline
 from models.sampling.constraints import ConstraintConfig
 from models.scene import CATEGORIES, CATEGORY_INDEX, VEHICLES, Scene
@@ -50,9 +50,12 @@ MEASURES = (*FAULTS, "buildings_on_road", "signs_unsupported", "poles_unsupporte
 @dataclass(frozen=True)
 class Config:
     model: str = "town"
+    town_version: int = 2
+    """Version of the town whose test scenes are the real scenes."""
     scenes: int = 128
     """Number of scenes per way, and of real scenes."""
     seed: int = 0
+    sampler: str = "sde-dpm++"
     steps: int = 20
     chunk: int = 8
     """Number of scenes per batch."""
@@ -80,9 +83,9 @@ def measure_scene(scene: Scene, slab_offset_m: float) -> np.ndarray:
     return np.array(pairs, np.float64)
 
 
-def make_real_scenes(pipeline: PrITTIPipeline, count: int) -> list[Scene]:
+def make_real_scenes(pipeline: PrITTIPipeline, count: int, town_version: int) -> list[Scene]:
     towns = 8
-    drives = [generate_town(TEST_SEEDS_START + k) for k in range(towns)]
+    drives = [generate_town(TEST_SEEDS_START + k, town_version) for k in range(towns)]
     per_town = -(-count // towns)
     scenes = [
         drive.scene(int(number), "test") for drive in drives for number in np.linspace(0, len(drive) - 1, per_town)
@@ -113,13 +116,13 @@ def print_table(records: dict[str, np.ndarray], counts: dict[str, np.ndarray], s
 
 def main(config: Config) -> None:
     pipeline = load_pipeline(config.model)
-    pipeline.use_sampler("dpm++")
+    pipeline.use_sampler(config.sampler)
     offset_m = pipeline.spec.slab_offset_m
     guidance = ConstraintConfig(
         last=config.last, every=config.every, iterations=config.iterations, step=config.step, trust=config.trust
     )
     repair = Repair(slab_offset_m=offset_m, drop=False)
-    labels = LABELS[pipeline.dit.config.label]
+    labels = list_usual_labels(pipeline.dit.config.label)
     made: dict[str, list[Scene]] = {name: [] for name in WAYS}
     seconds = dict.fromkeys(WAYS, 0.0)
     reports = []
@@ -143,7 +146,7 @@ def main(config: Config) -> None:
             began = time.process_time()
             made[way] += generate(way, numbers)
             seconds[way] += time.process_time() - began
-    sets = {"data": make_real_scenes(pipeline, config.scenes)} | made
+    sets = {"data": make_real_scenes(pipeline, config.scenes, config.town_version)} | made
     print(describe_machine(), guidance)
     print(f"{config.scenes} scenes per column, {sum(r.fallbacks for r in reports)} fallbacks", flush=True)
     records = {name: np.stack([measure_scene(one, offset_m) for one in scenes]) for name, scenes in sets.items()}
