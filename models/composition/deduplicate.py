@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
-from models.geometry.suppression import DUPLICATE_IOU3D, find_suppressed
+from models.geometry.suppression import DUPLICATE_IOU3D, find_redundant
 from models.scene import Scene
 
 REGENERATED_IOU3D = 0.05  # The IoU3D of a known object and its displaced copy is higher.
@@ -41,9 +41,9 @@ def find_regenerated_objects(generated: Scene, known: Scene) -> np.ndarray:
 
 
 def find_lower_confidence_duplicates(scene: Scene) -> np.ndarray:
-    """Find the solid objects that non-maximum suppression removes.
+    """Find the solid objects that decoding removes as duplicates.
 
-    See `find_suppressed` for the rule.
+    See `find_redundant` for the rule.
 
     Args:
         scene: Decoded scene.
@@ -51,4 +51,4 @@ def find_lower_confidence_duplicates(scene: Scene) -> np.ndarray:
     Returns:
         (n,) bool; True for each object to remove.
     """
-    return find_suppressed(extract_boxes(scene), scene.category, scene.existence)
+    return find_redundant(extract_boxes(scene), scene.category, scene.existence)

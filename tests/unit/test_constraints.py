@@ -102,6 +102,14 @@ def test_penetration_ignores_pairs_that_overlap_in_data():
     assert measure(make_ground(), pole, house)["penetration"] > 1
 
 
+def test_penetration_has_larger_tolerance_for_walls_in_buildings():
+    """A wall of 1 x 1 m reaches 0.9 or 1.5 m into a building whose side is at x = 18."""
+    house = ("construction_big", (20, 0, 2), (4, 4, 4), 0.0, 0.999999)
+    for depth_m, expected_m in ((0.9, 0.0), (1.5, 0.5)):
+        wall = ("construction_small", (17 + depth_m, 0, 0.5), (2, 1, 1), 0.0, 0.999999)
+        assert measure(make_ground(), house, wall)["penetration"] == pytest.approx(expected_m, abs=1e-3)
+
+
 def test_footprint_of_building_half_on_road():
     """A square building of 10 m, half of it on the road, has a penalty of 5 m."""
     ground = make_ground(road=column_mask(32, 0), terrain=column_mask(0, -32))

@@ -102,10 +102,33 @@ def test_suppress_duplicates_ignores_suppressed_objects():
     assert find([0.7, 0.9, 0.8]) == [True, False, True]
 
 
-def test_suppress_duplicates_keeps_walls_that_continue():
-    # The IoU is 1 / 3, which a decoder's errors can cause where two walls meet.
-    assert not find_lower_confidence_duplicates(make_row_of_boxes([0, 2], [0.9, 0.8], "construction_small")).any()
-    assert find_lower_confidence_duplicates(make_row_of_boxes([0, 2], [0.9, 0.8], "object")).any()
+def test_suppress_duplicates_removes_walls_in_buildings():
+    def find(centre_m, house_existence=0.5):
+        """Return whether each of a building of 10 x 10 x 6 m and a wall of 4 x 1 x 1 m at a place (m) is removed."""
+        scene = make_row_of_boxes([0, 0], [house_existence, 0.9])
+        return find_lower_confidence_duplicates(
+            replace(
+                scene,
+                center_m=np.float32([[20, 0, 3], centre_m]),
+                size_m=np.float32([[10, 10, 6], [4, 1, 1]]),
+                category=np.int8([CATEGORY_INDEX["construction_big"], CATEGORY_INDEX["construction_small"]]),
+            )
+        ).tolist()
+
+    assert find((20, 0, 1)) == [False, True]  # The building stays although its existence probability is lower.
+    assert find((24.9, 0, 1)) == [False, True]  # 52.5 % of the wall lie inside.
+    assert find((25.1, 0, 1)) == [False, False]  # 47.5 % lie inside.
+    assert find((20, 0, 6.1)) == [False, False]  # 40 % lie below the roof.
+
+
+def test_suppress_duplicates_keeps_walls_without_building():
+    doubled = make_row_of_boxes([0, 0, 0], [0.9, 0.8, 0.9])
+    house = CATEGORY_INDEX["construction_big"]
+    doubled = replace(doubled, category=np.int8([CATEGORY_INDEX["construction_small"], house, house]))
+    # The building with the lower probability is a duplicate of the other one, in which the wall lies.
+    assert find_lower_confidence_duplicates(doubled).tolist() == [True, True, False]
+    apart = replace(doubled, center_m=doubled.center_m + np.float32([[0, 0, 0], [9, 0, 0], [9, 0, 0]]))
+    assert find_lower_confidence_duplicates(apart).tolist() == [False, True, False]
 
 
 def test_suppress_duplicates_keeps_plants_and_other_categories():
