@@ -1,6 +1,6 @@
 """Draw the picture of README from the released weights: scenes by label, one of them outpainted, and street views.
 
-python docs/hero.py            writes docs/pictures/hero.png in half a minute on two cores
+python docs/hero.py            writes docs/pictures/hero.png in two minutes on two cores
 """
 
 from __future__ import annotations

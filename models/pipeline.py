@@ -557,7 +557,11 @@ class PrITTIPipeline:
         return torch.tensor([find_label_index(self.dit.config.label, name) for name in labels], device=self.device)
 
     def make_denoiser(
-        self, timesteps: np.ndarray | Tensor, label: Int[Tensor, " b"], guidance_scale: float = 1.0
+        self,
+        timesteps: np.ndarray | Tensor,
+        label: Int[Tensor, " b"],
+        guidance_scale: float = 1.0,
+        pag_scale: float | None = None,
     ) -> Denoiser:
         """Return the DiT with guidance and precomputed modulations, run as `set_execution` says.
 
@@ -571,31 +575,33 @@ class PrITTIPipeline:
             timesteps: All timesteps that the denoiser will receive.
             label: Class index of each scene.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
+            pag_scale: Scale of perturbed-attention guidance; None: the scale of `use_pag`.
 
         Returns:
             Function that maps latents (b, c, h, w), timesteps (b,) and labels (b,) to noise.
         """
+        pag_scale = self.pag_scale if pag_scale is None else pag_scale
         null = self.dit.null_label
         labels = {*label.tolist()} if guidance_scale == 1.0 else {*label.tolist(), null}
         weights = tuple((weight.data_ptr(), _get_version(weight)) for weight in self.dit.parameters())
-        key = tuple(sorted({*timesteps.tolist()})), guidance_scale, self.pag_scale, self.execution, weights
+        key = tuple(sorted({*timesteps.tolist()})), guidance_scale, pag_scale, self.execution, weights
         if self._denoiser is not None and self._denoiser[0] == key:
             if labels <= self._denoiser[1]:
                 return self._denoiser[2]
             labels |= self._denoiser[1]
         self._denoiser = None  # Free the old graph before the next capture.
 
-        def build(steps: list[int], pag_scale: float) -> Denoiser:
+        def build(steps: list[int], scale: float) -> Denoiser:
             with self.execution.autocast(self.device):
-                model = self.dit.precompute_conditioning(steps, labels, pag_scale)
+                model = self.dit.precompute_conditioning(steps, labels, scale)
             return self.execution.wrap(with_guidance(model, null, guidance_scale), self.device)
 
-        start = PAG_START * self.diffusion.num_timesteps if self.pag_scale else float("inf")
+        start = PAG_START * self.diffusion.num_timesteps if pag_scale else float("inf")
         guided, plain = ([int(t) for t in timesteps if (t >= start) == side] for side in (True, False))
         if not guided or not plain:
-            model = build(guided or plain, self.pag_scale if guided else 0.0)
+            model = build(guided or plain, pag_scale if guided else 0.0)
         else:
-            model = switch_at_timestep(start, build(guided, self.pag_scale), build(plain, 0.0))
+            model = switch_at_timestep(start, build(guided, pag_scale), build(plain, 0.0))
         self._denoiser = key, labels, model
         return model
 
@@ -778,7 +784,8 @@ class PrITTIPipeline:
         noise = SceneNoise(seed, indices, self.latent_shape, self.device, purpose)
         label = self.label_tensor(labels)
         scaling = 1.0 if repaint.eta == 1 else self.config.noise_scaling
-        model = scale_noise(self.make_denoiser(schedule.timesteps, label, guidance_scale), scaling)
+        # Perturbed-attention guidance doubles the number of small objects here (docs/experiments/town2_weights.md).
+        model = scale_noise(self.make_denoiser(schedule.timesteps, label, guidance_scale, 0.0), scaling)
         with (
             self._step_callback(repaint.num_evaluations, callback_on_step_end) as on_step,
             self._guide(model, schedule.timesteps, condition) as guided,

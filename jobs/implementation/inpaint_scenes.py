@@ -30,7 +30,6 @@ def inpaint(config: Config) -> dict[str, float | None]:
         repaint=make_repaint_config(config),
         execution=make_execution(config),
         guidance_scale=config.guidance_scale,
-        pag_scale=config.pag_scale,
         constraints=config.constraints,
     )
     with hold_output(request.output, request.source, config), JobProgress() as bar:

@@ -60,7 +60,6 @@ def outpaint(config: Config) -> list[str]:
         repaint=make_repaint_config(config),
         execution=make_execution(config),
         guidance_scale=config.guidance_scale,
-        pag_scale=config.pag_scale,
         constraints=config.constraints,
         num_blocks=counts,
         order=config.order,

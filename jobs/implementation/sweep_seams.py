@@ -60,7 +60,6 @@ def sweep_seams(config: Config) -> list[dict]:
                     mode=mode,
                     repaint=RePaintConfig(*setting),
                     guidance_scale=config.guidance_scale,
-                    pag_scale=config.pag_scale,
                     constraints=config.constraints,
                     batch_size=config.batch_size,
                 )

@@ -87,7 +87,6 @@ class GenerationOptions(SceneOptions):
     """Random seed."""
     guidance_scale: float = 1.0
     """Classifier-free guidance scale; 1 switches guidance off."""
-    pag_scale: PagScaleOption = None
     constraints: ConstraintsOption = None
     num_actors: int = 1
     """Number of pipelines that run in parallel; use one per GPU."""

@@ -98,7 +98,6 @@ class InpaintRequest(Request):
         guidance_scale: Scale of classifier-free guidance.
         execution: How the model runs.
         constraints: Whether constraints guide sampling. None: the value that the model stores.
-        pag_scale: Scale of perturbed-attention guidance. None: the value that the model stores.
     """
 
     where: RegionConfig
@@ -110,7 +109,6 @@ class InpaintRequest(Request):
     guidance_scale: float
     execution: SamplingExecution = field(default_factory=SamplingExecution)
     constraints: bool | None = None
-    pag_scale: float | None = None
 
 
 def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
@@ -235,7 +233,6 @@ class Inpainter:
         self.request, self.chosen = request, chosen
         self.pipeline = load_pipeline(request.model)
         self.pipeline.use_constraints(request.constraints)
-        self.pipeline.use_pag(request.pag_scale)
         self.pipeline.set_execution(request.execution)
 
     def __call__(self, row: dict) -> dict:
@@ -297,7 +294,6 @@ def inpaint_scenes(
     request = replace(
         request,
         constraints=pipeline.resolve_constraints(request.constraints),
-        pag_scale=pipeline.resolve_pag_scale(request.pag_scale),
     )
     guard_generation_run(
         request,

@@ -62,7 +62,6 @@ class OutpaintRequest(Request):
         batch_size: Maximum number of blocks per batch.
         execution: How the model runs.
         constraints: Whether constraints guide sampling. None: the value that the model stores.
-        pag_scale: Scale of perturbed-attention guidance. None: the value that the model stores.
     """
 
     label: str | None
@@ -76,7 +75,6 @@ class OutpaintRequest(Request):
     batch_size: int = 4
     execution: SamplingExecution = field(default_factory=SamplingExecution)
     constraints: bool | None = None
-    pag_scale: float | None = None
 
     def scene_id(self, number: int) -> str:
         """Return the id of an extended scene.
@@ -218,7 +216,6 @@ class Outpainter:
         self.request, self.chosen = request, chosen
         self.pipeline = load_pipeline(request.model)
         self.pipeline.use_constraints(request.constraints)
-        self.pipeline.use_pag(request.pag_scale)
         self.pipeline.set_execution(request.execution)
 
     @cached_property
@@ -351,7 +348,6 @@ def outpaint_scenes(
         request,
         mode=request.mode or pipeline.config.neighbour_latents,
         constraints=pipeline.resolve_constraints(request.constraints),
-        pag_scale=pipeline.resolve_pag_scale(request.pag_scale),
     )
     block_grid = request.make_block_grid(pipeline.latent_shape[-1])
     parts = [storage.join_uri(request.output, "blocks", request.run)]

@@ -141,6 +141,12 @@ def test_pipeline_stores_pag_scale_and_guides_noisy_timesteps(tmp_path):
         noises[scale] = [denoise(latent, torch.full((2,), timestep), label) for timestep in (900, 200, 199, 5)]
     alike = [torch.allclose(*pair, atol=1e-5) for pair in zip(*noises.values(), strict=True)]
     assert alike == [False, False, True, True]
+    found = []
+    known = InpaintCondition(torch.zeros(1, *loaded.latent_shape), torch.ones(1, *loaded.latent_shape))
+    for scale in (2.0, 0.0):
+        loaded.use_pag(scale)
+        found.append(loaded.inpaint_latents(known, ["low"], 0, [0], QUICK))
+    assert torch.equal(*found)  # Inpainting does not use the guidance.
     for scale in (-1.0, 21.0):
         with pytest.raises(ValueError, match=rf"pag_scale is {scale}, expected 0 to 20"):
             loaded.use_pag(scale)
