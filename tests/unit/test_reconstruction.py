@@ -1,5 +1,6 @@
 """Tests of reconstruction scores of single scenes, with a perfect decoder and an untrained model."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,8 +81,10 @@ def test_labels_of_reconstruction_use_threshold_of_generation(monkeypatch, tmp_p
         made = make_scene_record(scene, layout, LATENT, SPEC, make_voxel_grid(SPEC), label_threshold=threshold)
         assert made.pairs.predictions.sum() == len(scene)
     assert judged == [20, 10]
-    assert read_existence_threshold(f"{find_pipeline_path('town')}/lvae") == 0.5
-    assert read_existence_threshold(str(tmp_path / "lvae")) == 0.3
+    assert read_existence_threshold(str(tmp_path / "lvae")) == 0.3  # The paper's threshold, without a pipeline.
+    index = json.loads(Path(find_pipeline_path("town"), "model_index.json").read_text())
+    (tmp_path / "model_index.json").write_text(json.dumps(index | {"existence_threshold": 0.5}))
+    assert read_existence_threshold(str(tmp_path / "lvae")) == 0.5
 
 
 def test_reconstruction_of_perfect_decoder_scores_one():

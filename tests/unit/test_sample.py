@@ -14,10 +14,10 @@ def test_sampler_guides_scenes_by_constraints(tmp_path):
     from pipelines.metrics.validity import find_faults
 
     request = SampleRequest(
-        find_pipeline_directory("town"), str(tmp_path), "plain", 4, ("low", "high"), 0, 10, 1.0, "dpm++"
+        find_pipeline_directory("town"), str(tmp_path), "plain", 4, ("low-medium", "high-low"), 0, 10, 1.0, "dpm++"
     )
     faults = []
-    for one in (request, replace(request, run="guided", constraints=True)):
+    for one in (replace(request, constraints=False), replace(request, run="guided", constraints=True)):
         sampler = Sampler(one, batch_size=4)
         rows = [sampler({"id": 0}) for _ in range(2)]
         steps = {row["guided"] for row in rows}  # Each shard has its own count.
@@ -35,7 +35,7 @@ def test_sampler_repairs_sampled_scenes(tmp_path):
     from pipelines.metrics.validity import find_faults
 
     request = SampleRequest(
-        find_pipeline_directory("town"), str(tmp_path), "plain", 16, ("low", "high"), 0, 10, 1.0, "dpm++"
+        find_pipeline_directory("town"), str(tmp_path), "plain", 16, ("low-medium", "high-low"), 0, 10, 1.0, "dpm++"
     )
     scenes, number = [], []
     for one in (request, replace(request, run="repaired", repair=True)):
