@@ -72,7 +72,11 @@ class TrainingRecord:
         scenes = self.data.get("num_train") if self.data else None
         if scenes is not None and scenes != data.get("num_train"):
             yield "training scenes", f"{scenes:,}"
-        yield "training time, h", f"{self.hours:.1f}"
+        yield (
+            ("training time, h", f"{self.hours:.1f}")
+            if self.hours >= 0.1
+            else ("training time, s", f"{3600 * self.hours:.0f}")
+        )
         yield from self.origin.items()
         yield "options", ", ".join(f"{key} {value}" for key, value in self.options.items() if key not in HIDDEN)
 
@@ -133,7 +137,12 @@ class ModelCard:
             f"noise scaling {self.sampling.get('noise_scaling', 1):g}, existence threshold "
             f"{self.sampling.get('existence_threshold', EXISTENCE_THRESHOLD):g}.*\n"
         )
-        yield f"Condition: {self.label} ({', '.join(self.labels)}).\n"
+        kinds = (
+            "the density of vegetation, then that of vehicles. `any` in place of a density leaves it open, and `-free` "
+            "at the end selects crops at any place and heading"
+        )
+        kinds = kinds if self.label == "partial" else f"{self.label} density"
+        yield f"Labels ({kinds}): {', '.join(self.labels)}.\n"
 
     def _describe_labels(self) -> str:
         """Return the sequence of labels of the judged scenes, or how often each label occurs if there are many."""
@@ -141,7 +150,7 @@ class ModelCard:
         if len(labels) <= len(self.labels):
             return f"Labels alternate: {', '.join(labels)}."
         shares = ", ".join(f"{label} ({count})" for label, count in Counter(labels).most_common())
-        return f"{len(labels)} labels alternate: {shares}."
+        return f"They have the first of {len(labels)} labels that alternate: {shares}."
 
     def _training(self) -> Iterator[str]:
         scenes = ", ".join(f"{count:,} {split}" for split, count in sorted(self.dataset["scenes"].items()))
@@ -219,6 +228,7 @@ class ModelCard:
         ]
         yield from render_table(("share of", "generated", "real"), rows)
         yield "## Use and limits\n"
+        yield from self._rare_categories()
         yield (
             "The model is intended for research on layouts, for tests of the tools, and as initial weights for "
             "training on other data. The model is trained only on the dataset above. If this dataset is a procedural "
@@ -226,6 +236,18 @@ class ModelCard:
             "`jobs/edit_scenes.py repair` repairs faults.\n"
         )
         yield "The licence of weights and code is Apache-2.0.\n"
+
+    def _rare_categories(self) -> Iterator[str]:
+        """Yield the categories whose number of objects differs from the data's by more than 15 %."""
+        means = {
+            name.removeprefix("num_"): (value["generated"]["value"], value["real"]["value"])
+            for name, value in self.scores["generation"]["statistics"].items()
+            if name.startswith("num_")
+        }
+        ratios = {name: made / real for name, (made, real) in means.items() if real and abs(made / real - 1) > 0.15}
+        if ratios:
+            listed = ", ".join(f"{name} {ratio:.2f}" for name, ratio in sorted(ratios.items(), key=lambda one: one[1]))
+            yield f"Objects per generated scene, divided by those per real scene, where not within 15 %: {listed}.\n"
 
     def _files(self) -> Iterator[str]:
         yield "## SHA-256\n"
