@@ -40,6 +40,7 @@ def write_cities(root, run: str, damaged: bool) -> None:
     (root / f"{source}.json").write_text(json.dumps(record))
 
 
+@pytest.mark.slow
 def test_towns_score_like_towns_and_damaged_ones_worse(real, tmp_path):
     for run, damaged in (("towns", False), ("bare", True)):
         write_cities(tmp_path / "cities", run, damaged)

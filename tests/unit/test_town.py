@@ -33,7 +33,11 @@ from pipelines.preprocess.sources.town.reference_statistics import (
 SMALL = Grid(resolution_m=1.0, rows=64, cols=64)
 
 
-@pytest.fixture(scope="module", params=TOWN_VERSIONS, ids=lambda version: f"version {version}")
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(version, marks=[pytest.mark.slow] if version == 1 else []) for version in TOWN_VERSIONS],
+    ids=lambda version: f"version {version}",
+)
 def version(request):
     return request.param
 
