@@ -2,9 +2,9 @@
 """Generate scenes with a trained pipeline.
 
     jobs/sample_scenes.py                                           64 town scenes, labels in equal parts
-    jobs/sample_scenes.py --num-scenes 1000 --labels low --seed 7 --num-actors 2
+    jobs/sample_scenes.py --num-scenes 1000 --labels low-any --seed 7 --num-actors 2
     jobs/sample_scenes.py --num-scenes 4 --num-glb 4                with GLB files of the first four
-    jobs/sample_scenes.py --sampler dpm++ --num-inference-steps 20  eleven times as fast
+    jobs/sample_scenes.py --sampler sde-dpm++ --num-inference-steps 20      the setting of the town's scores, faster
 
 The job writes the same Parquet tables as preprocessing, with source=generated-<run>. Scene i depends only on --seed, i
 and its label. The number of actors and the batch size have no effect. Run the same command again to resume after an
@@ -40,7 +40,8 @@ class Config:
     num_scenes: int = 64
     """Number of scenes to generate."""
     labels: tuple[str, ...] = ()
-    """Density labels, assigned to the scenes in turn (default: all labels of the model)."""
+    """Density labels, assigned to the scenes in turn. For the town, low-medium means low density of vegetation and
+    medium density of vehicles; see the glossary (default: all labels that specify each density)."""
     seed: int = 0
     """Random seed."""
     sampler: Literal["ddpm", "ddim", "dpm++", "sde-dpm++"] = "ddpm"

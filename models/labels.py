@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 
 from models.scene import DENSITIES
 
@@ -75,10 +76,14 @@ def find_label_index(kind: str, name: str) -> int:
         ValueError: The name is unknown. The message lists the valid names.
     """
     if name not in LABELS[kind]:
-        hint = f"; a density that the label does not specify is {ANY!r}" if kind == "partial" else ""
-        raise ValueError(
-            f"label {name!r} is unknown to a {kind} model, expected one of: {', '.join(LABELS[kind])}{hint}"
-        )
+        expected = f"one of: {', '.join(LABELS[kind])}"
+        if kind == "partial":
+            near = get_close_matches(str(name), LABELS[kind], 1, 0.0)[0]
+            expected = (
+                f"the densities of vegetation and of vehicles, such as {near!r}; a density is {', '.join(DENSITIES)} "
+                f"or {ANY!r} if it is left open, and {FREE!r} at the end selects crops at any place"
+            )
+        raise ValueError(f"label {name!r} is unknown to a {kind} model, expected {expected}")
     return LABELS[kind].index(name)
 
 

@@ -60,6 +60,7 @@ COMPONENTS = {"lvae": LayoutVAE, "dit": DiT}
 NEIGHBOUR_LATENTS = ("reencode", "copy", "paper")
 SCHEDULER_CONFIG = "scheduler/scheduler_config.json"
 MAX_PAG_SCALE = 20.0
+MAX_GUIDANCE_SCALE = 100.0
 PAG_START = 0.2  # Lowest timestep with perturbed-attention guidance, as a share of the number of timesteps.
 INDEX_RULES: dict[str, Rule] = {
     **dict.fromkeys((*COMPONENTS, "scheduler"), Sequential(Text(), 2, 2)),
@@ -554,6 +555,8 @@ class PrITTIPipeline:
         Raises:
             ValueError: A label is unknown to the model.
         """
+        if isinstance(labels, str) or not len(labels):
+            raise ValueError(f"labels is {labels!r}, expected a list with one label per scene")
         return torch.tensor([find_label_index(self.dit.config.label, name) for name in labels], device=self.device)
 
     def make_denoiser(
@@ -579,7 +582,14 @@ class PrITTIPipeline:
 
         Returns:
             Function that maps latents (b, c, h, w), timesteps (b,) and labels (b,) to noise.
+
+        Raises:
+            ValueError: The guidance scale is out of range.
         """
+        if not 0 <= guidance_scale <= MAX_GUIDANCE_SCALE:
+            raise ValueError(
+                f"guidance_scale is {guidance_scale}, expected 0 to {MAX_GUIDANCE_SCALE:g}; 1 switches the guidance off"
+            )
         pag_scale = self.pag_scale if pag_scale is None else pag_scale
         null = self.dit.null_label
         labels = {*label.tolist()} if guidance_scale == 1.0 else {*label.tolist(), null}
@@ -719,7 +729,7 @@ class PrITTIPipeline:
         Scene i depends only on the seed, indices[i] and labels[i], but not on the other scenes of the batch.
 
         Args:
-            labels: Label of each scene, such as "low".
+            labels: Label of each scene, such as "low-medium".
             seed: Seed of the run.
             indices: Index of each scene within the run (default: 0, 1, ...).
             num_inference_steps: Number of denoising steps; the paper uses 250.

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from models.dit import DiT
     from models.lvae import LayoutVAE
     from models.pipeline import PrITTIPipeline
+    from models.sampling.constraints import ConstraintConfig
     from models.sampling.repaint import RePaintConfig
     from models.scene import Scene
 
@@ -25,9 +26,10 @@ try:
 except PackageNotFoundError:  # the checkout is not installed as a package
     __version__ = "unknown"
 
-__all__ = ["DiT", "LayoutVAE", "PrITTIPipeline", "RePaintConfig", "Scene", "__version__"]
+__all__ = ["ConstraintConfig", "DiT", "LayoutVAE", "PrITTIPipeline", "RePaintConfig", "Scene", "__version__"]
 
 MODULES = {
+    "ConstraintConfig": "models.sampling.constraints",
     "DiT": "models.dit",
     "LayoutVAE": "models.lvae",
     "PrITTIPipeline": "models.pipeline",

@@ -22,7 +22,7 @@ def export_geojson(scene: Scene) -> bytes:
     """Export a scene to a GeoJSON feature collection.
 
     A ground class is one feature with a MultiPolygon. A primitive is one feature with the convex hull of its outline
-    seen from above: of its eight corners, or of its ellipsoid.
+    seen from above: of its eight corners, or of its ellipsoid. Coordinates are metres in the scene frame, not degrees.
 
     Args:
         scene: Scene.
@@ -40,7 +40,7 @@ def export_geojson(scene: Scene) -> bytes:
         center_m, size_m = (np.round(v[index].astype(float), DECIMALS).tolist() for v in (scene.center_m, scene.size_m))
         yaw_rad = round(float(scene.yaw_rad[index]), 6)
         features.append(_make_feature(outline_m, **about, center_m=center_m, size_m=size_m, yaw_rad=yaw_rad))
-    collection = {"type": "FeatureCollection", "name": scene.scene_id, "features": features}
+    collection = {"type": "FeatureCollection", "name": scene.scene_id, "unit": "m", "features": features}
     return json.dumps(collection, ensure_ascii=False).encode()
 
 
@@ -72,4 +72,5 @@ def list_outlines(scene: Scene) -> list[shapely.Geometry]:
 
 def _make_feature(shape: shapely.Geometry, **properties: object) -> dict:
     rounded = shapely.transform(shape, lambda points: np.round(points, DECIMALS))
+    rounded = shapely.orient_polygons(shapely.remove_repeated_points(rounded))  # RFC 7946: counter-clockwise exteriors.
     return {"type": "Feature", "geometry": json.loads(shapely.to_geojson(rounded)), "properties": properties}

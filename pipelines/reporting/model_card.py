@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
+from models.scene import DENSITIES
 from models.tensors import EXISTENCE_THRESHOLD
 from pipelines.metrics.controls import CONTROLS, list_headline_scores
 from pipelines.reporting.chart import Chart, format_number
@@ -121,7 +122,7 @@ class ModelCard:
             "64 m x 64 m, each with primitives and a rasterised ground. "
             f"`jobs/publish_model.py` wrote this card for version {self.version}.\n"
         )
-        yield "```python\nfrom models import PrITTIPipeline\n"
+        yield "```python\nfrom pritti import PrITTIPipeline\n"
         yield f'pipeline = PrITTIPipeline.from_pretrained("{self.name}")'
         yield (
             f'pipeline.use_sampler("{self.sampling["sampler"]}")\n'
@@ -238,7 +239,7 @@ class ModelCard:
         yield "The licence of weights and code is Apache-2.0.\n"
 
     def _rare_categories(self) -> Iterator[str]:
-        """Yield the categories whose number of objects differs from the data's by more than 15 %."""
+        """Yield the categories whose counts differ from the data's by more than 15 %, and the worst label."""
         means = {
             name.removeprefix("num_"): (value["generated"]["value"], value["real"]["value"])
             for name, value in self.scores["generation"]["statistics"].items()
@@ -248,6 +249,15 @@ class ModelCard:
         if ratios:
             listed = ", ".join(f"{name} {ratio:.2f}" for name, ratio in sorted(ratios.items(), key=lambda one: one[1]))
             yield f"Objects per generated scene, divided by those per real scene, where not within 15 %: {listed}.\n"
+        known = self.scores["generation"].get("label_fidelity") or {}
+        shares = {name: value["value"] for name, value in known.items() if value and name.endswith(DENSITIES)}
+        if shares and min(shares.values()) < 0.9:
+            name = min(shares, key=shares.__getitem__)
+            yield (
+                f"Only {shares[name]:.2f} of the scenes with the label {name.rsplit('_', 1)[1]} "
+                f"({name.split('_')[0]}) have the requested density. A guidance scale above 1 raises this share, and "
+                "moves scenes away from the data.\n"
+            )
 
     def _files(self) -> Iterator[str]:
         yield "## SHA-256\n"

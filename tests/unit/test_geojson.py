@@ -24,6 +24,7 @@ def test_geojson_holds_ground_and_primitives():
     for feature in ground:
         shape = shapely.from_geojson(json.dumps(feature["geometry"]))
         name = feature["properties"]["name"]
+        assert all(part.exterior.is_ccw and not any(hole.is_ccw for hole in part.interiors) for part in shape.geoms)
         assert shape.is_valid and shape.area == pytest.approx(exact[name].area, rel=0.01, abs=0.5)
         assert feature["properties"]["area_m2"] == pytest.approx(shape.area, abs=0.01)
     assert [f["properties"]["name"] for f in objects] == [CATEGORIES[c] for c in scene.category]

@@ -37,8 +37,11 @@ def test_partial_labels_cover_all_combinations():
 
 
 def test_half_a_label_is_an_error():
-    with pytest.raises(ValueError, match=r"label 'high' is unknown to a partial model.*does not specify is 'any'"):
+    expected = r"label 'high' is unknown to a partial model.*such as 'low-high'.*'any' if it is left open"
+    with pytest.raises(ValueError, match=expected):
         find_label_index("partial", "high")
+    with pytest.raises(ValueError, match="such as 'medium-medium-free'"):
+        find_label_index("partial", "medium-medium-fre")
 
 
 def test_dropped_labels_keep_the_pose():

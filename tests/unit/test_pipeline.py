@@ -124,6 +124,15 @@ def test_pipeline_noise_scaling_skips_ddpm_of_paper(pipeline, tmp_path):
     pipeline.use_sampler("ddpm")
 
 
+def test_pipeline_refuses_wrong_labels_and_guidance_scale(pipeline):
+    for labels in ("low", []):
+        with pytest.raises(ValueError, match="expected a list with one label per scene"):
+            pipeline.generate(labels, num_inference_steps=10)
+    for scale in (-1.0, 101.0, float("nan")):
+        with pytest.raises(ValueError, match=rf"guidance_scale is {scale}, expected 0 to 100"):
+            pipeline.generate(["low"], num_inference_steps=10, guidance_scale=scale)
+
+
 def test_pipeline_stores_pag_scale_and_guides_noisy_timesteps(tmp_path):
     stored = tiny_pipeline(SPEC)
     stored.register_to_config(pag_scale=2.0)
