@@ -553,7 +553,7 @@ class PrITTIPipeline:
             (b,) class indices.
 
         Raises:
-            ValueError: A label is unknown to the model.
+            ValueError: A label is unknown to the model, or `labels` is empty or one string.
         """
         if isinstance(labels, str) or not len(labels):
             raise ValueError(f"labels is {labels!r}, expected a list with one label per scene")
@@ -794,7 +794,7 @@ class PrITTIPipeline:
         noise = SceneNoise(seed, indices, self.latent_shape, self.device, purpose)
         label = self.label_tensor(labels)
         scaling = 1.0 if repaint.eta == 1 else self.config.noise_scaling
-        # Perturbed-attention guidance doubles the number of small objects here (docs/experiments/town2_weights.md).
+        # Perturbed-attention guidance would add too many objects (docs/experiments/town2_weights.md, Outpainting).
         model = scale_noise(self.make_denoiser(schedule.timesteps, label, guidance_scale, 0.0), scaling)
         with (
             self._step_callback(repaint.num_evaluations, callback_on_step_end) as on_step,

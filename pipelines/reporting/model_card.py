@@ -138,11 +138,12 @@ class ModelCard:
             f"noise scaling {self.sampling.get('noise_scaling', 1):g}, existence threshold "
             f"{self.sampling.get('existence_threshold', EXISTENCE_THRESHOLD):g}.*\n"
         )
-        kinds = (
-            "the density of vegetation, then that of vehicles. `any` in place of a density leaves it open, and `-free` "
-            "at the end selects crops at any place and heading"
-        )
-        kinds = kinds if self.label == "partial" else f"{self.label} density"
+        kinds = f"{self.label} density"
+        if self.label == "partial":
+            kinds = (
+                "the density of vegetation, then that of vehicles. `any` in place of a density leaves it open, and "
+                "`-free` at the end selects crops at any place and heading"
+            )
         yield f"Labels ({kinds}): {', '.join(self.labels)}.\n"
 
     def _describe_labels(self) -> str:
@@ -229,7 +230,7 @@ class ModelCard:
         ]
         yield from render_table(("share of", "generated", "real"), rows)
         yield "## Use and limits\n"
-        yield from self._rare_categories()
+        yield from self._describe_deviations()
         yield (
             "The model is intended for research on layouts, for tests of the tools, and as initial weights for "
             "training on other data. The model is trained only on the dataset above. If this dataset is a procedural "
@@ -238,7 +239,7 @@ class ModelCard:
         )
         yield "The licence of weights and code is Apache-2.0.\n"
 
-    def _rare_categories(self) -> Iterator[str]:
+    def _describe_deviations(self) -> Iterator[str]:
         """Yield the categories whose counts differ from the data's by more than 15 %, and the worst label."""
         means = {
             name.removeprefix("num_"): (value["generated"]["value"], value["real"]["value"])

@@ -37,9 +37,9 @@ def test_sampler_repairs_sampled_scenes(tmp_path):
     request = SampleRequest(
         find_pipeline_directory("town"), str(tmp_path), "plain", 6, ("low-medium", "high-low"), 0, 10, 1.0, "dpm++"
     )
+    request = replace(request, constraints=False)
     scenes, number = [], []
     for one in (request, replace(request, run="repaired", repair=True)):
-        one = replace(one, constraints=False)
         Sampler(one, batch_size=4)({"id": 0})
         made = list(read_scenes(str(tmp_path), source=one.source))
         found = [find_faults(scene, SLAB_OFFSET_M) for scene in made]
