@@ -44,8 +44,7 @@ def main() -> None:
     pipeline.set_progress_bar_config(desc="outpaint")
     made = {}
     for label in ("low-high", "medium-medium", "high-low"):
-        pipeline.use_sampler("sde-dpm++")
-        made[label] = pipeline.generate([label], seed=SEED, num_inference_steps=20)[0]
+        made[label] = pipeline.generate([label], seed=SEED)[0]
     larger = pipeline.outpaint(made["medium-medium"], "medium-medium", seed=SEED, repaint=RePaintConfig.guided())
     above = stack_pictures([render_3d(scene, WIDTH, HEIGHT) for scene in made.values()], 1)
     views = stack_pictures(draw_street_views(larger), 0)

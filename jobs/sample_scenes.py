@@ -4,7 +4,7 @@
     jobs/sample_scenes.py                                           64 town scenes, labels in equal parts
     jobs/sample_scenes.py --num-scenes 1000 --labels low-any --seed 7 --num-actors 2
     jobs/sample_scenes.py --num-scenes 4 --num-glb 4                with GLB files of the first four
-    jobs/sample_scenes.py --sampler sde-dpm++ --num-inference-steps 20      the setting of the town's scores, faster
+    jobs/sample_scenes.py --sampler ddpm                            the paper's sampler with 250 steps
 
 The job writes the same Parquet tables as preprocessing, with source=generated-<run>. Scene i depends only on --seed, i
 and its label. The number of actors and the batch size have no effect. Run the same command again to resume after an
@@ -44,10 +44,12 @@ class Config:
     medium density of vehicles; see the glossary (default: all labels that specify each density)."""
     seed: int = 0
     """Random seed."""
-    sampler: Literal["ddpm", "ddim", "dpm++", "sde-dpm++"] = "ddpm"
-    """Sampler: DDPM (the paper), DDIM, DPM-Solver++ (fewest steps), or the SDE variant of DPM-Solver++."""
-    num_inference_steps: int = 250
-    """Number of denoising steps (paper: 250)."""
+    sampler: Literal["ddpm", "ddim", "dpm++", "sde-dpm++"] | None = None
+    """Sampler: DDPM (the paper), DDIM, DPM-Solver++, or the SDE variant of DPM-Solver++ (default: published value,
+    ddpm for models of train_dit.py)."""
+    num_inference_steps: int | None = None
+    """Number of denoising steps (default: published value; with another --sampler, 250 for ddpm and ddim and 20 for
+    the others)."""
     guidance_scale: float = 1.0
     """Classifier-free guidance scale; 1 switches guidance off. Paper: 1 for the metrics, 4 for the pictures."""
     noise_scaling: float | None = None

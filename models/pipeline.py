@@ -32,7 +32,7 @@ from models.labels import FREE, find_label_index, split_label
 from models.layout import LayoutSpec
 from models.limits import require_within
 from models.lvae import LayoutVAE
-from models.options import Choice, Flag, Number, Rule, Sequential, Text, check_entries, show_value
+from models.options import Choice, Flag, Integer, Number, Rule, Sequential, Text, check_entries, show_value
 from models.pretrained import INDEX_NAME, find_pipeline_path
 from models.sampling.constraints import ConstraintConfig, ConstraintGuidance
 from models.sampling.diffusion import (
@@ -52,7 +52,7 @@ from models.sampling.diffusion import (
     with_guidance,
 )
 from models.sampling.repaint import NUM_INFERENCE_STEPS, RePaintConfig
-from models.sampling.schedulers import SchedulerConfig
+from models.sampling.schedulers import SAMPLERS, SchedulerConfig
 from models.scene import Scene
 from models.tensors import EXISTENCE_THRESHOLD, make_empty_scene, make_layout_batch
 
@@ -64,6 +64,7 @@ MAX_GUIDANCE_SCALE = 100.0
 PAG_START = 0.2  # Lowest timestep with perturbed-attention guidance, as a share of the number of timesteps.
 INDEX_RULES: dict[str, Rule] = {
     **dict.fromkeys((*COMPONENTS, "scheduler"), Sequential(Text(), 2, 2)),
+    "num_inference_steps": Integer(1, 2**31),
     "noise_scaling": Number(0.9, 1.1),
     "existence_threshold": Number(0, 1),
     "neighbour_latents": Choice(NEIGHBOUR_LATENTS),
@@ -131,6 +132,7 @@ class PrITTIPipeline:
         dit: Diffusion transformer that was trained on the latents of `lvae`.
         scheduler: Noise schedule and sampler, given as a SchedulerConfig or a diffusers scheduler. None: DDPM, as in
             the paper.
+        num_inference_steps: Default number of denoising steps; the paper uses 250.
         noise_scaling: Divisor of the predicted noise (`diffusion.scale_noise`) for all samplers except DDPM. The paper
             does not scale the noise.
         existence_threshold: Only primitives with a higher existence probability are kept; the paper uses 0.3.
@@ -158,12 +160,14 @@ class PrITTIPipeline:
         constraints: bool = False,
         attach: bool = True,
         pag_scale: float = 0.0,
+        num_inference_steps: int = NUM_INFERENCE_STEPS,
     ) -> None:
         self.lvae, self.dit = lvae.eval().requires_grad_(False), dit.eval().requires_grad_(False)
         self.scheduler = SchedulerConfig.ddpm(dit.diffusion)
         if scheduler is not None:
             self.scheduler = scheduler
         self.config = Config(
+            num_inference_steps=num_inference_steps,
             noise_scaling=noise_scaling,
             existence_threshold=existence_threshold,
             neighbour_latents=neighbour_latents,
@@ -217,10 +221,10 @@ class PrITTIPipeline:
         except ValueError as error:
             raise ValueError(f"{path / SCHEDULER_CONFIG}: {error}") from error
         components = {name: kind.from_pretrained(path / name, torch_dtype) for name, kind in COMPONENTS.items()}
-        names = ("noise_scaling", "existence_threshold", "neighbour_latents", "constraints", "attach", "pag_scale")
-        thresholds = {name: index[name] for name in names if name in index}
+        names = INDEX_RULES.keys() - COMPONENTS.keys() - {"scheduler"}
+        defaults = {name: index[name] for name in names if name in index}
         try:
-            return cls(**components, scheduler=scheduler, **thresholds)
+            return cls(**components, scheduler=scheduler, **defaults)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 
@@ -266,7 +270,7 @@ class PrITTIPipeline:
         self.scheduler_config, self._scheduler = config, built
 
     def use_sampler(self, name: str) -> None:
-        """Select a sampler by name.
+        """Select a sampler by name, with its default number of steps if it is not the current sampler.
 
         To use any other diffusers scheduler, assign it to `scheduler`.
 
@@ -276,7 +280,9 @@ class PrITTIPipeline:
         Raises:
             ValueError: The name is unknown.
         """
-        self.scheduler = self.scheduler_config.with_sampler(name)
+        if name != self.scheduler_config.sampler:
+            self.scheduler = self.scheduler_config.with_sampler(name)
+            self.register_to_config(num_inference_steps=SAMPLERS[name].num_inference_steps)
 
     @property
     def uses_ddpm(self) -> bool:
@@ -668,7 +674,7 @@ class PrITTIPipeline:
         labels: Sequence[str],
         seed: int | Sequence[int],
         indices: Sequence[int],
-        num_inference_steps: int = NUM_INFERENCE_STEPS,
+        num_inference_steps: int | None = None,
         guidance_scale: float = 1.0,
         callback_on_step_end: StepCallback | None = None,
         noise_scaling: float | None = None,
@@ -679,7 +685,7 @@ class PrITTIPipeline:
             labels: Label of each scene.
             seed: One seed for all scenes, or one per scene.
             indices: Index of each scene within the run.
-            num_inference_steps: Number of denoising steps; the paper uses 250.
+            num_inference_steps: Number of denoising steps; None: the default of the pipeline.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `generate`.
             noise_scaling: Divisor of the predicted noise; None: the default of the pipeline.
@@ -692,15 +698,16 @@ class PrITTIPipeline:
         """
         noise = SceneNoise(seed, indices, self.latent_shape, self.device)
         label, noise_scaling = self.label_tensor(labels), self.resolve_noise_scaling(noise_scaling)
-        with self._step_callback(num_inference_steps, callback_on_step_end) as on_step:
+        steps: int = self.config.num_inference_steps if num_inference_steps is None else num_inference_steps
+        with self._step_callback(steps, callback_on_step_end) as on_step:
             if self.uses_ddpm:
-                schedule = SamplingSchedule(self.diffusion, num_inference_steps)
+                schedule = SamplingSchedule(self.diffusion, steps)
                 model = scale_noise(self.make_denoiser(schedule.timesteps, label, guidance_scale), noise_scaling)
                 with self._guide(model, schedule.timesteps) as guided:
                     return sample(guided, schedule, noise, label, on_step=on_step)
             # Raise an error for an invalid number of steps; diffusers would accept it.
-            self.diffusion.select_timesteps(num_inference_steps)
-            self.scheduler.set_timesteps(num_inference_steps, device=self.device)
+            self.diffusion.select_timesteps(steps)
+            self.scheduler.set_timesteps(steps, device=self.device)
             timesteps = self.scheduler.timesteps
             if timesteps.is_floating_point():
                 raise ValueError(
@@ -716,7 +723,7 @@ class PrITTIPipeline:
         labels: Sequence[str],
         seed: int = 0,
         indices: Sequence[int] | None = None,
-        num_inference_steps: int = NUM_INFERENCE_STEPS,
+        num_inference_steps: int | None = None,
         guidance_scale: float = 1.0,
         run: str = "run",
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
@@ -732,7 +739,7 @@ class PrITTIPipeline:
             labels: Label of each scene, such as "low-medium".
             seed: Seed of the run.
             indices: Index of each scene within the run (default: 0, 1, ...).
-            num_inference_steps: Number of denoising steps; the paper uses 250.
+            num_inference_steps: Number of denoising steps; None: the default of the pipeline.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             run: Run name; it is part of the scene ids.
             generator: One generator for all scenes, or one per scene. None: `seed` is used; otherwise, `seed` is

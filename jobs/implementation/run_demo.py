@@ -38,8 +38,6 @@ def show_released(config: Config) -> None:
             output=home_path("released"),
             num_scenes=config.num_released_scenes,
             seed=config.seed,
-            sampler="dpm++",
-            num_inference_steps=20,
             num_glb=1,
         )
     )

@@ -240,7 +240,7 @@ class Start:
 
     digest: str
     inherited: dict  # Shift and scale of the latents, and noise schedule, for these weights.
-    sampling: dict  # Noise scaling and existence threshold of the pipeline.
+    sampling: dict  # Arguments of the pipeline: sampler, number of steps, noise scaling, existence threshold, guidance.
     state: dict[str, Tensor]
 
 
@@ -266,9 +266,8 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
                 "use equal values"
             )
     inherited = {"shift": built["shift"], "scale": built["scale"], "schedule": pipeline.dit.diffusion}
-    sampling = {
-        key: pipeline.config[key] for key in ("noise_scaling", "existence_threshold", "constraints", "pag_scale")
-    }
+    names = ("num_inference_steps", "noise_scaling", "existence_threshold", "constraints", "pag_scale")
+    sampling = {"scheduler": pipeline.scheduler_config} | {name: pipeline.config[name] for name in names}
     return Start(digest_weights(pipeline.dit), inherited, sampling, pipeline.dit.state_dict())
 
 

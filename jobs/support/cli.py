@@ -95,7 +95,7 @@ def resolve_path(path: str, *default: str) -> str:
 
 
 def require_positive(config: object, *names: str) -> None:
-    """Check integer options.
+    """Check integer options, of which None means the default.
 
     Args:
         config: Options of a job.
@@ -105,7 +105,7 @@ def require_positive(config: object, *names: str) -> None:
         ValueError: One of the named options is below 1.
     """
     for name in names:
-        if (value := getattr(config, name)) < 1:
+        if (value := getattr(config, name)) is not None and value < 1:
             raise ValueError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
 
 

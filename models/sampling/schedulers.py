@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from models.options import LARGE, Choice, Flag, Integer, Number, Rule, check_entries, check_entry, show_value
 from models.sampling.diffusion import PAPER_SCHEDULE, Diffusion
+from models.sampling.repaint import NUM_INFERENCE_STEPS
 
 # Options of the class `DDPMScheduler` of the library `diffusers` without those of the noise schedule.
 DDPM_CONFIG = {
@@ -26,15 +27,31 @@ DDPM_CONFIG = {
     "rescale_betas_zero_snr": False,
 }
 
-# Class and options of each sampler. DPM-Solver++ uses timesteps that are uniform in log signal-to-noise ratio. A test
+
+class Sampler(NamedTuple):
+    """A sampler of diffusers.
+
+    Attributes:
+        class_name: Name of the scheduler's class in diffusers.
+        options: Options of the class without those of the noise schedule.
+        num_inference_steps: Default number of steps; for DDPM, that of the paper.
+    """
+
+    class_name: str
+    options: dict[str, Any]
+    num_inference_steps: int
+
+
+# DPM-Solver++ uses timesteps that are uniform in log signal-to-noise ratio. A test
 # samples a Gaussian distribution with a tenth of the latent's standard deviation. With 20 of these timesteps, the
 # samples have 93 % of the true standard deviation. With 20 timesteps that are uniform in time, the samples have 31 % of
 # the true standard deviation.
-SAMPLERS: dict[str, tuple[str, dict[str, Any]]] = {
-    "ddpm": ("DDPMScheduler", {"timestep_spacing": "leading"}),
-    "ddim": ("DDIMScheduler", {"timestep_spacing": "leading"}),
-    "dpm++": ("DPMSolverMultistepScheduler", {"use_lu_lambdas": True, "algorithm_type": "dpmsolver++"}),
-    "sde-dpm++": ("DPMSolverMultistepScheduler", {"use_lu_lambdas": True, "algorithm_type": "sde-dpmsolver++"}),
+DPM_SOLVER = "DPMSolverMultistepScheduler"
+SAMPLERS = {
+    "ddpm": Sampler("DDPMScheduler", {"timestep_spacing": "leading"}, NUM_INFERENCE_STEPS),
+    "ddim": Sampler("DDIMScheduler", {"timestep_spacing": "leading"}, NUM_INFERENCE_STEPS),
+    "dpm++": Sampler(DPM_SOLVER, {"use_lu_lambdas": True, "algorithm_type": "dpmsolver++"}, 20),
+    "sde-dpm++": Sampler(DPM_SOLVER, {"use_lu_lambdas": True, "algorithm_type": "sde-dpmsolver++"}, 20),
 }
 
 
@@ -152,11 +169,19 @@ class SchedulerConfig:
                     f"{self.class_name}: {name} is {self.config.get(name)}, but the DiT was trained with {value}"
                 )
 
+    @property
+    def sampler(self) -> str:
+        """Name of the sampler, a key of `SAMPLERS`; for any other scheduler, the name of its class."""
+        for name, sampler in SAMPLERS.items():
+            if self.class_name == sampler.class_name and self.config | sampler.options == self.config:
+                return name
+        return self.class_name
+
     def with_sampler(self, name: str) -> SchedulerConfig:
         """Return a config with the same noise schedule but another sampler.
 
         Args:
-            name: Name of the sampler, a key of `SAMPLERS`.
+            name: Name of the sampler, a key of `SAMPLERS`; the current name returns this config.
 
         Returns:
             The new config.
@@ -164,10 +189,11 @@ class SchedulerConfig:
         Raises:
             ValueError: The name is unknown.
         """
+        if name == self.sampler:
+            return self
         if name not in SAMPLERS:
             raise ValueError(f"sampler {name!r} is unknown, expected one of: {', '.join(SAMPLERS)}")
-        class_name, options = SAMPLERS[name]
-        return SchedulerConfig(class_name, self.config | options)
+        return SchedulerConfig(SAMPLERS[name].class_name, self.config | SAMPLERS[name].options)
 
     def build(self) -> Any:
         """Import diffusers and build the scheduler (a SchedulerMixin).

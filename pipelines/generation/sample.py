@@ -66,9 +66,9 @@ class SampleRequest(Request):
         num_scenes: Number of scenes.
         labels: Labels; scene i gets label labels[i mod len(labels)].
         seed: Seed of the noise.
-        num_inference_steps: Number of steps of the sampler.
+        num_inference_steps: Number of steps of the sampler. None: the default of the sampler or of the model.
         guidance_scale: Scale of classifier-free guidance.
-        sampler: Name of the sampler.
+        sampler: Name of the sampler. None: the sampler that the model stores.
         noise_scaling: Noise scaling. None: the value that the model stores.
         existence_threshold: Minimum existence probability. None: the value that the model stores.
         constraints: Whether constraints guide sampling. None: the value that the model stores.
@@ -82,9 +82,9 @@ class SampleRequest(Request):
     num_scenes: int
     labels: tuple[str, ...]
     seed: int
-    num_inference_steps: int
+    num_inference_steps: int | None
     guidance_scale: float
-    sampler: str = "ddpm"
+    sampler: str | None = None
     noise_scaling: float | None = None
     existence_threshold: float | None = None
     constraints: bool | None = None
@@ -223,7 +223,8 @@ class Sampler:
     def __init__(self, request: SampleRequest, batch_size: int) -> None:
         self.request, self.batch_size = request, batch_size
         self.pipeline = load_pipeline(request.model)
-        self.pipeline.use_sampler(request.sampler)
+        if request.sampler is not None:
+            self.pipeline.use_sampler(request.sampler)
         self.pipeline.use_pag(request.pag_scale)
         self.pipeline.set_execution(request.execution)
         self.repair = Repair(slab_offset_m=self.pipeline.spec.slab_offset_m, drop=False)
@@ -294,9 +295,13 @@ def sample_scenes(
     """
     pipeline = load_pipeline(request.model)
     require_labels(pipeline.dit.config.label, request.labels)
-    pipeline.use_sampler(request.sampler)
+    if request.sampler is not None:
+        pipeline.use_sampler(request.sampler)
+    steps = pipeline.config.num_inference_steps if request.num_inference_steps is None else request.num_inference_steps
     request = replace(
         request,
+        sampler=pipeline.scheduler_config.sampler,
+        num_inference_steps=steps,
         noise_scaling=pipeline.resolve_noise_scaling(request.noise_scaling),
         existence_threshold=pipeline.resolve_existence_threshold(request.existence_threshold),
         constraints=pipeline.resolve_constraints(request.constraints),

@@ -124,11 +124,7 @@ class ModelCard:
         )
         yield "```python\nfrom pritti import PrITTIPipeline\n"
         yield f'pipeline = PrITTIPipeline.from_pretrained("{self.name}")'
-        yield (
-            f'pipeline.use_sampler("{self.sampling["sampler"]}")\n'
-            f'scenes = pipeline.generate(["{self.labels[0]}"], seed=0, '
-            f"num_inference_steps={self.sampling['num_inference_steps']})\n```\n"
-        )
+        yield f'scenes = pipeline.generate(["{self.labels[0]}"], seed=0)\n```\n'
         yield (
             f"![First scenes without selection](samples.png)\n\n*First scenes of seed {self.sampling['seed']}, without "
             f"selection. {self._describe_labels()} Sampler {self.sampling['sampler']}, "

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
-from diffusers import DPMSolverMultistepScheduler
+from diffusers import DPMSolverMultistepScheduler, UniPCMultistepScheduler
 from helpers import LATENT_SHAPE, QUICK, random_scene, scenes_equal, small_spec, tiny_pipeline
 
 from models.composition.inpaint import (
@@ -33,7 +33,7 @@ from models.sampling.diffusion import (
     scale_noise,
 )
 from models.sampling.repaint import RePaintConfig
-from models.sampling.schedulers import SAMPLERS, SchedulerConfig
+from models.sampling.schedulers import SAMPLERS, SchedulerConfig, list_schedule_options
 from models.scene import Grid
 from models.training import make_diffusion_loss
 
@@ -101,6 +101,27 @@ def test_pipeline_round_trip_keeps_sampler(pipeline, tmp_path):
         pipeline.use_sampler(name)
         pair = [p.generate(["high"], seed=1, num_inference_steps=5)[0] for p in (pipeline, again)]
         assert scenes_equal(*pair)
+
+
+def test_stored_sampler_and_steps_are_the_defaults(pipeline, tmp_path):
+    assert (pipeline.scheduler_config.sampler, pipeline.config.num_inference_steps) == ("ddpm", 250)  # the paper
+    pipeline.use_sampler("sde-dpm++")
+    assert pipeline.config.num_inference_steps == 20
+    pipeline.register_to_config(num_inference_steps=6)
+    pipeline.use_sampler("sde-dpm++")  # the same sampler keeps its number of steps
+    pipeline.save_pretrained(tmp_path)
+    made = pipeline.generate(["high"], seed=1, num_inference_steps=6)[0]
+    pipeline.use_sampler("ddpm")
+    assert pipeline.config.num_inference_steps == 250
+    again = PrITTIPipeline.from_pretrained(tmp_path)
+    again.set_progress_bar_config(disable=True)
+    assert again.scheduler_config.sampler == "sde-dpm++" and scenes_equal(again.generate(["high"], seed=1)[0], made)
+    again.scheduler = UniPCMultistepScheduler(**list_schedule_options(again.diffusion))
+    assert again.scheduler_config.sampler == "UniPCMultistepScheduler" and again.config.num_inference_steps == 6
+    again.use_sampler("UniPCMultistepScheduler")  # the name of the current scheduler changes nothing
+    assert again.config.num_inference_steps == 6
+    released = PrITTIPipeline.from_pretrained("town")
+    assert (released.scheduler_config.sampler, released.config.num_inference_steps) == ("sde-dpm++", 20)
 
 
 def test_pipeline_noise_scaling_skips_ddpm_of_paper(pipeline, tmp_path):
