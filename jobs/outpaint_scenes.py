@@ -6,6 +6,7 @@
     jobs/outpaint_scenes.py --blocks-ahead 9 --blocks-behind 0 --blocks-left 0 --blocks-right 0     along its street
     jobs/outpaint_scenes.py --input DIR --source town --split test --max-scenes 8 --num-actors 2
     jobs/outpaint_scenes.py --guided                                     fast, with smoother seams
+    jobs/outpaint_scenes.py --guided --labels-map labels.json            one label per block
 
 By default, the job adds eight blocks around a scene, as in the paper: four sides in one batch, then four corners. The
 job writes scene tables with source=generated-<run> and one GLB file per scene. The tables in block_tables/ contain the
@@ -45,6 +46,12 @@ class Config(RePaintOptions):
     order: Literal["outward", "colours"] = "outward"
     """Order of blocks: outward from the scene (the paper), or four groups of independent blocks (needs --overlap <
     0.5)."""
+    labels_map: str = ""
+    """JSON file with one list per row of blocks, farthest ahead first, each with one label per block, leftmost first;
+    replaces --label."""
+    free_blocks: Literal["none", "beside", "all"] = "none"
+    """Blocks that are sampled as crops at any place and heading, instead of views of a vehicle: those beside the street
+    of the given scene (beside), or all blocks. Only models with labels such as low-medium-free distinguish both."""
     neighbour_latents: Literal["reencode", "copy", "paper"] | None = None
     """How a block uses its neighbours: reencode encodes them again in the frame of the block, copy copies and shifts
     their latents. paper does the same as copy, but without blending the ground and without removing duplicates

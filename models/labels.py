@@ -106,6 +106,19 @@ def compose_label(kind: str, vegetation: str | None, vehicle: str | None, free_p
     return {"vegetation": vegetation, "vehicle": vehicle, "none": LABELS["none"][0]}[kind]
 
 
+def mark_free(kind: str, label: str) -> str:
+    """Return the label of crops at any place and heading that has the same densities.
+
+    Args:
+        kind: Kind of label, a key of `LABELS`.
+        label: Name of the label.
+
+    Returns:
+        Name of the label; the same label if labels of this kind do not distinguish crops from views of a vehicle.
+    """
+    return label if kind != "partial" or label.endswith(FREE) else label + FREE
+
+
 def split_label(kind: str, label: str) -> tuple[str | None, str | None]:
     """Return the density labels of vegetation and vehicles that belong to a label.
 

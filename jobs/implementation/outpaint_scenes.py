@@ -8,6 +8,7 @@ from rich.progress import MofNCompleteColumn, Progress
 
 from jobs.implementation.checks import check_outpaint_scenes
 from jobs.outpaint_scenes import Config
+from jobs.support.cli import make_absolute
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
@@ -43,6 +44,20 @@ def count_blocks(config: Config) -> tuple[int, int, int, int]:
     return counts
 
 
+def read_labels_map(path: str) -> tuple[tuple[str, ...], ...]:
+    """Return the labels of a map, row by row.
+
+    Raises:
+        ValueError: The file does not hold lists of labels.
+    """
+    rows = storage.read_json(make_absolute(path))
+    if not isinstance(rows, list) or not all(
+        isinstance(row, list) and all(isinstance(name, str) for name in row) for row in rows
+    ):
+        raise ValueError(f'--labels-map {path}: expected lists of labels, such as [["low-low", "low-high"]]')
+    return tuple(tuple(row) for row in rows)
+
+
 def outpaint(config: Config) -> list[str]:
     """Extend scenes and write them; return the path of each scene's table with the known ground in each block."""
     counts = count_blocks(config)
@@ -54,6 +69,8 @@ def outpaint(config: Config) -> list[str]:
         output=config.output_directory(),
         run=config.run,
         label=config.label or None,
+        labels_map=read_labels_map(config.labels_map) if config.labels_map else None,
+        free_blocks=config.free_blocks,
         seed=config.seed,
         overlap=config.overlap,
         mode=config.neighbour_latents,

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from models.composition.generator import SceneGenerator, StepCallback
 from models.composition.seam_blending import extract_new_part, extrapolate_ground
+from models.labels import mark_free, require_labels
 from models.layout import LayoutSpec
 from models.sampling.diffusion import OUTPAINT, InpaintCondition
 from models.sampling.repaint import RePaintConfig
@@ -33,6 +34,12 @@ BlockIndex = tuple[int, int]  # (i, j): i steps ahead of block (0, 0), j steps t
 # How a block uses its neighbours. "reencode" and "copy" differ in the known latents (`BlockComposer.condition_block`);
 # both blend the ground and remove duplicates. "paper" copies the latents and does neither.
 MODES = ("reencode", "copy", "paper")
+# Blocks that count as crops at any place and heading: none, those beside the street of block (0, 0), or all others.
+FREE_BLOCKS: dict[str, Callable[[BlockIndex], bool]] = {
+    "none": lambda index: False,
+    "beside": lambda index: index[1] != 0,
+    "all": lambda index: index != (0, 0),
+}
 EncodeScenes = Callable[[Sequence[Scene]], Tensor]  # Maps scenes on the model's grid to latents (b, c, h, w).
 
 
@@ -394,6 +401,47 @@ class BlockComposer:
         classes = self.spec.ground_classes
         primitives = concatenate_primitives(objects)
         return replace(like, grid=grid, height_m=height, occupied=occupied, ground_classes=classes, **primitives)
+
+
+def label_blocks(
+    kind: str,
+    label: str | Sequence[Sequence[str]],
+    num_blocks: tuple[int, int, int, int],
+    free_blocks: str = "none",
+) -> dict[BlockIndex, str]:
+    """Return the label of each block of a rectangle.
+
+    Args:
+        kind: Kind of label of the model, a key of `LABELS`.
+        label: Label of all blocks; or a map with one row per row of blocks, of which the first is farthest ahead, and
+            one label per block, of which the first is leftmost.
+        num_blocks: Number of blocks ahead of, behind, to the left of and to the right of block (0, 0).
+        free_blocks: Blocks that count as crops at any place and heading: a key of FREE_BLOCKS. Only partial labels
+            distinguish crops from views of a vehicle.
+
+    Returns:
+        Label by block.
+
+    Raises:
+        ValueError: The map has another size, a label is unknown, or `free_blocks` is unknown.
+    """
+    if free_blocks not in FREE_BLOCKS:
+        raise ValueError(f"free_blocks is {free_blocks!r}, expected one of: {', '.join(FREE_BLOCKS)}")
+    ahead, behind, left, right = num_blocks
+    rows, cols = ahead + behind + 1, left + right + 1
+    labels = [[label] * cols] * rows if isinstance(label, str) else label
+    if len(labels) != rows or any(len(row) != cols for row in labels):
+        found = " and ".join(str(width) for width in sorted({len(row) for row in labels}))
+        raise ValueError(
+            f"the label map has {len(labels)} rows with {found or 'no'} labels, but the city has {rows} rows with "
+            f"{cols} blocks each"
+        )
+    require_labels(kind, {name for row in labels for name in row})
+    by_block = {}
+    for index in product(range(-behind, ahead + 1), range(-right, left + 1)):
+        name = labels[ahead - index[0]][left - index[1]]
+        by_block[index] = mark_free(kind, name) if FREE_BLOCKS[free_blocks](index) else name
+    return by_block
 
 
 def generate_blocks(

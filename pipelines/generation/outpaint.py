@@ -20,6 +20,7 @@ from models.composition.outpaint import (
     SceneBlock,
     find_ground_height,
     generate_blocks,
+    label_blocks,
     rank_four_colors,
     rank_outward,
 )
@@ -52,6 +53,8 @@ class OutpaintRequest(Request):
 
     Attributes:
         label: Label of the generated blocks. None: the label of each scene is used.
+        labels_map: Label of each block in rows, instead of `label` (`label_blocks`). The input scene does not change.
+        free_blocks: Blocks that count as crops at any place and heading (`label_blocks`).
         seed: Seed of the noise.
         overlap: Overlap of neighbouring blocks as a fraction of a block.
         mode: Outpainting mode of `generate_blocks`. None: the mode that the pipeline stores.
@@ -75,6 +78,8 @@ class OutpaintRequest(Request):
     batch_size: int = 4
     execution: SamplingExecution = field(default_factory=SamplingExecution)
     constraints: bool | None = None
+    labels_map: tuple[tuple[str, ...], ...] | None = None
+    free_blocks: str = "none"
 
     def scene_id(self, number: int) -> str:
         """Return the id of an extended scene.
@@ -265,13 +270,15 @@ class Outpainter:
         """
         request = self.request
         composer, given, known = self.load_blocks(batch.number, sorted(batch.needs))
+        kind = self.pipeline.dit.config.label
+        label = request.labels_map or request.label or find_scene_label(given, kind)
         blocks = generate_blocks(
             self.pipeline,
             composer,
             batch.indices,
             known,
             given,
-            request.label or find_scene_label(given, self.pipeline.dit.config.label),
+            label_blocks(kind, label, request.num_blocks, request.free_blocks),
             request.seed,
             batch.number,
             request.mode or self.pipeline.config.neighbour_latents,
@@ -349,6 +356,8 @@ def outpaint_scenes(
         mode=request.mode or pipeline.config.neighbour_latents,
         constraints=pipeline.resolve_constraints(request.constraints),
     )
+    if request.labels_map:  # Raise an error before actors start.
+        label_blocks(pipeline.dit.config.label, request.labels_map, request.num_blocks)
     block_grid = request.make_block_grid(pipeline.latent_shape[-1])
     parts = [storage.join_uri(request.output, "blocks", request.run)]
     guard_generation_run(request, pipeline, parts, input=asdict(selection), scenes=selection.files())

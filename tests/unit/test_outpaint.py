@@ -14,6 +14,7 @@ from models.composition.outpaint import (
     BlockGrid,
     SceneBlock,
     find_ground_height,
+    label_blocks,
     rank_four_colors,
     rank_outward,
 )
@@ -210,6 +211,29 @@ def test_block_composer_marks_blocks_that_know_only_empty_ground(truth):
 
 
 # ---------------------------------------------------------------------------------------------------------- pipeline
+
+
+def test_label_map_rows_start_far_ahead_and_left():
+    rows = [["low-low", "low-medium", "low-high"], ["high-low", "high-medium", "high-high"]]
+    labels = label_blocks("partial", rows, (1, 0, 1, 1))
+    assert [labels[1, j] for j in (1, 0, -1)] == rows[0] and [labels[0, j] for j in (1, 0, -1)] == rows[1]
+    with pytest.raises(ValueError, match="the label map has 2 rows with 3 labels, but the city has 3 rows with 3"):
+        label_blocks("partial", rows, (1, 1, 1, 1))
+    with pytest.raises(ValueError, match="2 rows with 2 and 3 labels, but the city has 2 rows with 3 blocks each"):
+        label_blocks("partial", [rows[0], rows[1][:2]], (1, 0, 1, 1))
+    with pytest.raises(ValueError, match="label 'lots' is unknown"):
+        label_blocks("partial", [["lots"]], (0, 0, 0, 0))
+
+
+def test_free_blocks_are_crops_and_the_others_views():
+    assert set(label_blocks("partial", "low-high", (1, 1, 1, 1)).values()) == {"low-high"}
+    beside = label_blocks("partial", "low-high", (1, 1, 1, 1), "beside")
+    assert {index for index, label in beside.items() if label == "low-high-free"} == set(CORNERS) | {(0, 1), (0, -1)}
+    everywhere = label_blocks("partial", "low-high", (1, 1, 1, 1), "all")
+    assert [index for index, label in everywhere.items() if label == "low-high"] == [(0, 0)]
+    assert set(label_blocks("joint", "low-high", (1, 1, 1, 1), "all").values()) == {"low-high"}  # joint has no crops
+    with pytest.raises(ValueError, match="free_blocks is 'some', expected one of: none, beside, all"):
+        label_blocks("partial", "low-high", (1, 1, 1, 1), "some")
 
 
 def test_outpaint_keeps_given_scene_and_takes_label_per_block(pipeline):
