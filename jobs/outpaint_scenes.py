@@ -7,11 +7,15 @@
     jobs/outpaint_scenes.py --input DIR --source town --split test --max-scenes 8 --num-actors 2
     jobs/outpaint_scenes.py --guided                                     fast, with smoother seams
     jobs/outpaint_scenes.py --guided --labels-map labels.json            one label per block
+    jobs/outpaint_scenes.py --guided --order colours --overlap 0.25 --extent-m 2000 2000 --tile-m 256     in tiles
 
 By default, the job adds eight blocks around a scene, as in the paper: four sides in one batch, then four corners. The
-job writes scene tables with source=generated-<run> and one GLB file per scene. The tables in block_tables/ contain the
-share of known ground in each block. The job generates a block as soon as all neighbours that the block depends on are
-complete. The result does not depend on the number of actors.
+job writes scene tables with source=generated-<run> and one GLB file per scene. With --tile-m, it writes one scene and
+one GLB file per tile, and a 3D Tiles tileset, glb/<run>/<scene>/tileset.json. No process then holds a whole city.
+
+The tables in block_tables/ contain the share of known ground in each block. The job generates a block as soon as all
+neighbours that the block depends on are complete. The result does not depend on the number of actors. Run the same
+command again to resume after an interruption.
 """
 
 from __future__ import annotations
@@ -52,6 +56,8 @@ class Config(RePaintOptions):
     free_blocks: Literal["none", "beside", "all"] = "none"
     """Blocks that are sampled as crops at any place and heading, instead of views of a vehicle: those beside the street
     of the given scene (beside), or all blocks. Only models with labels such as low-medium-free distinguish both."""
+    tile_m: float | None = None
+    """Side of the tiles in metres, at least 64 (default: each result is written as one scene)."""
     neighbour_latents: Literal["reencode", "copy", "paper"] | None = None
     """How a block uses its neighbours: reencode encodes them again in the frame of the block, copy copies and shifts
     their latents. paper does the same as copy, but without blending the ground and without removing duplicates

@@ -71,6 +71,7 @@ def outpaint(config: Config) -> list[str]:
         label=config.label or None,
         labels_map=read_labels_map(config.labels_map) if config.labels_map else None,
         free_blocks=config.free_blocks,
+        tile_m=config.tile_m,
         seed=config.seed,
         overlap=config.overlap,
         mode=config.neighbour_latents,

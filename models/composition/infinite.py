@@ -138,12 +138,4 @@ class InfiniteScene:
         # Along x, block i extends from block.back_m + i step_m to block.front_m + i step_m.
         ahead = range(int((grid.back_m - block.front_m) // step_m), int((grid.front_m - block.back_m) // step_m) + 2)
         left = range(int((grid.right_m - block.left_m) // step_m), int((grid.left_m - block.right_m) // step_m) + 2)
-        return [
-            (i, j)
-            for i in ahead
-            for j in left
-            if block.back_m + i * step_m < grid.front_m
-            and block.front_m + i * step_m > grid.back_m
-            and block.right_m + j * step_m < grid.left_m
-            and block.left_m + j * step_m > grid.right_m
-        ]
+        return [(i, j) for i in ahead for j in left if self.composer.covers((i, j), grid)]

@@ -254,6 +254,43 @@ class BlockCondition:
         return self.known.grid.upsample_cells(self.mask[0].cpu().numpy() > 0)
 
 
+@dataclass(frozen=True)
+class Tile:
+    """A rectangle of a large scene.
+
+    Attributes:
+        row: Number of tiles between this tile and the rear border of the scene.
+        col: Number of tiles between this tile and the right border of the scene.
+        grid: Pixel grid in the frame of block (0, 0).
+        blocks: Blocks that cover parts of the tile.
+    """
+
+    row: int
+    col: int
+    grid: Grid
+    blocks: tuple[BlockIndex, ...]
+
+    @property
+    def origin_m(self) -> tuple[float, float, float]:
+        """Origin of the frame of the tile, the middle of its rear border, in the frame of block (0, 0) (m)."""
+        return self.grid.back_m, (self.grid.left_m + self.grid.right_m) / 2, 0.0
+
+    def to_own_frame(self, scene: Scene) -> Scene:
+        """Move the content of the tile to the frame of the tile.
+
+        Args:
+            scene: Content of the tile in the frame of block (0, 0).
+
+        Returns:
+            The same content; `world_xyz_m` states where the frame of the tile lies in the world frame.
+        """
+        x_m, y_m, _ = self.origin_m
+        cos, sin = np.cos(scene.world_yaw_rad), np.sin(scene.world_yaw_rad)
+        x, y, z = scene.world_xyz_m
+        origin = (x + cos * x_m - sin * y_m, y + sin * x_m + cos * y_m, z)
+        return replace(scene.translate(-x_m, -y_m), world_xyz_m=origin, world_from_imu=None)
+
+
 def find_ground_height(scene: Scene, x_m: float, y_m: float) -> float:
     """Return the ground height at the occupied pixel that is nearest to a point.
 
@@ -296,6 +333,68 @@ class BlockComposer:
     def step_m(self) -> float:
         """Distance between neighbouring blocks in metres."""
         return self.step_px * self.spec.grid.resolution_m
+
+    def find_grid(self) -> Grid:
+        """Return the pixel grid of all blocks of a bounded block grid, in the frame of block (0, 0)."""
+        indices, small = self.block_grid.indices(), self.spec.grid
+        (behind, right), (ahead, left) = (
+            tuple(pick(index[k] for index in indices) for k in (0, 1)) for pick in (min, max)
+        )
+        return replace(
+            small,
+            front_m=small.front_m + ahead * self.step_m,
+            left_m=small.left_m + left * self.step_m,
+            rows=small.rows + (ahead - behind) * self.step_px,
+            cols=small.cols + (left - right) * self.step_px,
+        )
+
+    def cut_tiles(self, tile_m: float | None = None) -> list[Tile]:
+        """Cut the area of all blocks into tiles. The last tile of a row or a column may be smaller.
+
+        Args:
+            tile_m: Side of a tile (metres); None: one tile covers all blocks.
+
+        Returns:
+            Tiles, row by row from the rear border, each row from the right border.
+
+        Raises:
+            ValueError: The side is no multiple of the pixel size, or is smaller than a block.
+        """
+        whole, small, pixel_m = self.find_grid(), self.spec.grid, self.spec.grid.resolution_m
+        side = max(whole.rows, whole.cols) if tile_m is None else round(tile_m / pixel_m)
+        if tile_m is not None and (side < small.rows or abs(side * pixel_m - tile_m) > 1e-6):
+            raise ValueError(
+                f"the side of a tile is {tile_m:g} m, expected at least {small.rows * pixel_m:g} m and a multiple of "
+                f"the pixel size ({pixel_m:g} m)"
+            )
+        tiles = []
+        for row, col in product(range(-(-whole.rows // side)), range(-(-whole.cols // side))):
+            rows, cols = (min(side, total - k * side) for k, total in ((row, whole.rows), (col, whole.cols)))
+            front_m = whole.back_m + (row * side + rows) * pixel_m
+            left_m = whole.right_m + (col * side + cols) * pixel_m
+            grid = replace(whole, front_m=front_m, left_m=left_m, rows=rows, cols=cols)
+            tiles.append(
+                Tile(row, col, grid, tuple(index for index in self.block_grid.indices() if self.covers(index, grid)))
+            )
+        return tiles
+
+    def covers(self, index: BlockIndex, grid: Grid) -> bool:
+        """Test whether a block covers a pixel of a grid.
+
+        Args:
+            index: Index of the block.
+            grid: Grid in the frame of block (0, 0).
+
+        Returns:
+            True if the block and the grid have a common pixel.
+        """
+        x_m, y_m, small = index[0] * self.step_m, index[1] * self.step_m, self.spec.grid
+        return (
+            small.back_m + x_m < grid.front_m
+            and small.front_m + x_m > grid.back_m
+            and small.right_m + y_m < grid.left_m
+            and small.left_m + y_m > grid.right_m
+        )
 
     def to_block_frame(self, index: BlockIndex, other: BlockIndex, block: SceneBlock) -> Scene:
         """Crop a block to the area of another block.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -18,6 +19,7 @@ from models.composition.outpaint import (
     BlockGrid,
     BlockIndex,
     SceneBlock,
+    Tile,
     find_ground_height,
     generate_blocks,
     label_blocks,
@@ -36,6 +38,7 @@ from pipelines.generation.sample import (
     resample_to_model_grid,
 )
 from pipelines.io.mesh_export import export_glb
+from pipelines.io.tileset import TileContent, find_tile_bounds, make_tileset
 from pipelines.runtime import storage
 from pipelines.runtime.resources import make_model_resources, require_room
 from pipelines.schema.scene_subset import SceneSubset
@@ -55,6 +58,8 @@ class OutpaintRequest(Request):
         label: Label of the generated blocks. None: the label of each scene is used.
         labels_map: Label of each block in rows, instead of `label` (`label_blocks`). The input scene does not change.
         free_blocks: Blocks that count as crops at any place and heading (`label_blocks`).
+        tile_m: Side (m) of the tiles in which a scene is written. No step holds a whole scene in memory. None: each
+            scene is written as a whole.
         seed: Seed of the noise.
         overlap: Overlap of neighbouring blocks as a fraction of a block.
         mode: Outpainting mode of `generate_blocks`. None: the mode that the pipeline stores.
@@ -80,6 +85,7 @@ class OutpaintRequest(Request):
     constraints: bool | None = None
     labels_map: tuple[tuple[str, ...], ...] | None = None
     free_blocks: str = "none"
+    tile_m: float | None = None
 
     def scene_id(self, number: int) -> str:
         """Return the id of an extended scene.
@@ -130,6 +136,21 @@ class BlockBatch:
 
     number: int
     indices: tuple[BlockIndex, ...]
+    needs: frozenset[BlockIndex]
+
+
+@dataclass(frozen=True)
+class TileTask:
+    """A tile of a scene to write.
+
+    Attributes:
+        number: Number of the scene in the run.
+        tile: Number of the tile in the list of `BlockComposer.cut_tiles`.
+        needs: Indices of the blocks that cover the tile, without the input block.
+    """
+
+    number: int
+    tile: int
     needs: frozenset[BlockIndex]
 
 
@@ -288,29 +309,62 @@ class Outpainter:
         for index, block in blocks.items():
             write_block(block, make_block_path(request.blocks_directory(batch.number), index))
 
+    def write_tile(self, task: TileTask) -> None:
+        """Stitch the blocks of a tile; write its tables and its GLB.
+
+        Args:
+            task: Tile to write. Without tiles, it covers the scene.
+        """
+        request = self.request
+        composer, given, blocks = self.load_blocks(task.number, sorted(task.needs))
+        tiles = composer.cut_tiles(request.tile_m)
+        tile, name = tiles[task.tile], request.scene_id(task.number)
+        scene = composer.stitch(blocks, given, tile.grid)
+        path = f"{name}.glb"
+        if request.tile_m is not None:
+            part = make_tile_name(tile)
+            bounds = find_tile_bounds(scene)  # In the frame of the input scene.
+            storage.write_json(bounds, storage.join_uri(request.output, "glb", request.run, name, f"{part}.json"))
+            scene, name, path = tile.to_own_frame(scene), f"{name}-{part}", f"{name}/{part}.glb"
+        scene = replace(scene, scene_id=name, source=request.source, split="generated", frame=task.number)
+        path = storage.join_uri(request.output, "glb", request.run, path)
+        storage.write_whole(path, lambda stream: stream.write(export_glb(scene)))
+        request.shard(task.number * len(tiles) + task.tile).write([scene])
+
     def finish(self, number: int) -> None:
-        """Stitch the blocks of a scene; write its tables, its GLB and a table of blocks; delete the block files.
+        """Write the table of blocks of a scene, and its tileset if it has tiles; delete the block files.
 
         Args:
             number: Number of the scene in the run.
         """
-        request = self.request
-        composer, given, blocks = self.load_blocks(
-            number, [index for index in self.block_grid.indices() if index != (0, 0)]
-        )
-        name = request.scene_id(number)
-        scene = replace(
-            composer.stitch(blocks, given), scene_id=name, source=request.source, split="generated", frame=number
-        )
-        path = storage.join_uri(request.output, "glb", request.run, f"{name}.glb")
-        storage.write_whole(path, lambda stream: stream.write(export_glb(scene)))
-        rows = [
-            {"scene_id": name, "ahead": i, "left": j, "datum_m": block.datum_m, "known_ground": block.known_ground}
-            for (i, j), block in sorted(blocks.items())
-        ]
+        request, name, rows = self.request, self.request.scene_id(number), []
+        composer, given, blocks = self.load_blocks(number, [])
+        directory = request.blocks_directory(number)
+        for index in sorted(self.block_grid.indices()):  # One block at a time, because a city may have thousands.
+            block = blocks[index] if index in blocks else read_block(make_block_path(directory, index), given)
+            about = {"datum_m": block.datum_m, "known_ground": block.known_ground}
+            rows.append({"scene_id": name, "ahead": index[0], "left": index[1], **about})
+        if request.tile_m is not None:
+            tiles, place = [], storage.join_uri(request.output, "glb", request.run, name)
+            for tile in composer.cut_tiles(request.tile_m):
+                part = make_tile_name(tile)
+                low_m, high_m = storage.read_json(storage.join_uri(place, f"{part}.json"))
+                tiles.append(TileContent(part, low_m, high_m, tile.origin_m))
+            storage.write_json(make_tileset(tiles), storage.join_uri(place, "tileset.json"))
         storage.write_parquet(pa.Table.from_pylist(rows), make_blocks_table_path(request, number))
-        request.shard(number).write([scene])
         storage.delete_directory(request.blocks_directory(number))
+
+
+def make_tile_name(tile: Tile) -> str:
+    """Return the name of a tile within its scene, such as 003-012: row, then column.
+
+    Args:
+        tile: Tile.
+
+    Returns:
+        Name.
+    """
+    return f"{tile.row:03d}-{tile.col:03d}"
 
 
 def make_blocks_table_path(request: OutpaintRequest, number: int) -> str:
@@ -347,7 +401,8 @@ def outpaint_scenes(
         Path of the table of blocks of each scene (`make_blocks_table_path`), in order.
 
     Raises:
-        ValueError: The output contains a run of the same name with other options.
+        ValueError: The output contains a run of the same name with other options, the label map has another size than
+            the scenes, or the side of the tiles is invalid.
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
@@ -362,10 +417,16 @@ def outpaint_scenes(
     parts = [storage.join_uri(request.output, "blocks", request.run)]
     guard_generation_run(request, pipeline, parts, input=asdict(selection), scenes=selection.files())
 
-    promised = {request.shard(number): 1 for number in range(len(chosen))}
+    tiles = BlockComposer(block_grid, pipeline.spec, pipeline.encode).cut_tiles(request.tile_m)
+    promised = {request.shard(number): 1 for number in range(len(chosen) * len(tiles))}
     files = set(storage.list_files(parts[0], ".safetensors"))
-    waiting, done = [], {}
-    for number in [shard.number for shard in find_unwritten(promised)]:
+    unwritten = {shard.number for shard in find_unwritten(promised)}
+    waiting, missing, done = [], [], {}
+    for number in range(len(chosen)):
+        left = [k for k in range(len(tiles)) if number * len(tiles) + k in unwritten]
+        if not left and storage.exists(make_blocks_table_path(request, number)):
+            continue
+        missing += [TileTask(number, k, frozenset(tiles[k].blocks) - {(0, 0)}) for k in left]
         directory = request.blocks_directory(number)
         there = {index for index in block_grid.indices() if make_block_path(directory, index) in files}
         done[number] = there
@@ -373,8 +434,10 @@ def outpaint_scenes(
     if on_blocks:
         per_scene = len(block_grid.indices()) - 1
         on_blocks(per_scene * len(chosen) - sum(len(batch.indices) for batch in waiting))
+    if request.tile_m is not None:  # Complete row after row of tiles.
+        waiting.sort(key=lambda batch: (batch.number, batch.indices[0][0] // 2, block_grid.rank(batch.indices[0])))
     if done:
-        run_batches(request, chosen, waiting, done, num_actors, on_blocks)
+        run_batches(request, chosen, waiting, missing, done, num_actors, on_blocks)
     require_written(promised)
     return [make_blocks_table_path(request, number) for number in range(len(chosen))]
 
@@ -383,6 +446,7 @@ def run_batches(
     request: OutpaintRequest,
     chosen: list[tuple[Shard, int]],
     waiting: list[BlockBatch],
+    tiles: list[TileTask],
     done: dict[int, set[BlockIndex]],
     num_actors: int,
     on_blocks: Callable[[int], None] | None,
@@ -393,6 +457,7 @@ def run_batches(
         request: Options of outpainting.
         chosen: Shard and row of each selected scene.
         waiting: Batches to generate.
+        tiles: Tiles to write.
         done: Finished blocks by scene number.
         num_actors: Maximum number of actors.
         on_blocks: Called with the number of blocks of each finished batch.
@@ -405,16 +470,20 @@ def run_batches(
     count = min(num_actors, max(len(waiting), len(done)), require_room(need, 1, "an actor (Outpainter)"))
     workers: list[Any] = [actor.remote(request, chosen) for _ in range(count)]
     try:
-        schedule_batches(workers, waiting, done, on_blocks)
+        schedule_batches(workers, waiting, tiles, done, on_blocks)
     finally:  # The traceback of an error references the actors. Without ray.kill, the actors would keep their CPUs.
         for worker in workers:
             ray.kill(worker)
 
 
 def schedule_batches(
-    workers: list, waiting: list[BlockBatch], done: dict[int, set[BlockIndex]], on_blocks: Callable[[int], None] | None
+    workers: list,
+    waiting: list[BlockBatch],
+    tiles: list[TileTask],
+    done: dict[int, set[BlockIndex]],
+    on_blocks: Callable[[int], None] | None,
 ) -> None:
-    """Give each idle actor a batch, or a scene to stitch, until all work is done.
+    """Give each idle actor a batch, a tile to write or a scene to finish, until all work is done.
 
     Actors may become ready at different times, because other work may occupy their CPUs. Each actor gets work as soon
     as it is ready.
@@ -422,17 +491,19 @@ def schedule_batches(
     Args:
         workers: Actor handles.
         waiting: Batches to generate; the function empties the list.
+        tiles: Tiles to write; the function empties the list.
         done: Finished blocks by scene number; the function adds the new blocks.
         on_blocks: Called with the number of blocks of each finished batch.
     """
     idle: list = []
     running: dict[ray.ObjectRef, tuple] = {worker.__ray_ready__.remote(): (None, worker) for worker in workers}
-    left = {number: sum(batch.number == number for batch in waiting) for number in done}
-    whole = [number for number, batches_left in left.items() if not batches_left]
-    while waiting or whole or any(task is not None for task, _ in running.values()):
-        while idle and (task := pop_ready_task(waiting, whole, done)) is not None:
+    left = dict.fromkeys(done, 0) | Counter(task.number for task in (*waiting, *tiles))
+    whole = [number for number, tasks_left in left.items() if not tasks_left]
+    while waiting or tiles or whole or any(task is not None for task, _ in running.values()):
+        while idle and (task := pop_ready_task(waiting, tiles, whole, done)) is not None:
             worker = idle.pop()
-            call = worker.generate if isinstance(task, BlockBatch) else worker.finish
+            calls = {BlockBatch: worker.generate, TileTask: worker.write_tile, int: worker.finish}
+            call = calls[type(task)]
             running[call.remote(task)] = task, worker
         (finished,), _ = ray.wait(list(running), num_returns=1)
         task, worker = running.pop(finished)
@@ -440,30 +511,32 @@ def schedule_batches(
         idle.append(worker)
         if isinstance(task, BlockBatch):
             done[task.number].update(task.indices)
+            if on_blocks:
+                on_blocks(len(task.indices))
+        if isinstance(task, (BlockBatch, TileTask)):
             left[task.number] -= 1
             if not left[task.number]:
                 whole.append(task.number)
-            if on_blocks:
-                on_blocks(len(task.indices))
 
 
 def pop_ready_task(
-    waiting: list[BlockBatch], whole: list[int], done: Mapping[int, set[BlockIndex]]
-) -> BlockBatch | int | None:
+    waiting: list[BlockBatch], tiles: list[TileTask], whole: list[int], done: Mapping[int, set[BlockIndex]]
+) -> BlockBatch | TileTask | int | None:
     """Remove and return the first task whose dependencies are done.
 
     Args:
         waiting: Batches to generate.
-        whole: Numbers of the scenes in which all blocks are done. Complete scenes are stitched before further blocks
-            are generated.
+        tiles: Tiles to write. Tiles whose blocks are done are written before further blocks are generated.
+        whole: Numbers of the scenes in which all tiles are written.
         done: Finished blocks by scene number.
 
     Returns:
-        A batch, or the number of a scene to stitch. None: no task is ready.
+        A batch, a tile, or the number of a scene to finish. None: no task is ready.
     """
     if whole:
         return whole.pop(0)
-    for position, batch in enumerate(waiting):
-        if batch.needs <= done[batch.number]:
-            return waiting.pop(position)
+    for tasks in (tiles, waiting):
+        for position, task in enumerate(tasks):
+            if task.needs <= done[task.number]:
+                return tasks.pop(position)
     return None

@@ -1,5 +1,6 @@
 """Tests of the generation jobs on Ray with the smoke presets: resuming, actors, killed processes and scores."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 from helpers import kill_ray_workers
+from scipy.spatial import cKDTree
 
-from models.scene import DENSITIES
+from models.scene import DENSITIES, Scene
 from pipelines.runtime import storage
 from pipelines.schema.tables import find_shards, read_scenes
 
@@ -237,6 +239,31 @@ def test_sample_loses_no_scene_after_actor_kill(smoke, samples, tmp_path):
     assert all(np.array_equal(a.occupied, b.occupied) for a, b in zip(again, before, strict=True))
 
 
+def check_tiles(directory, whole: Scene) -> None:
+    """Compare the tiles of a run with the whole scene, and each GLB file with its bounds in the tileset."""
+    tiles = list(read_scenes(str(directory)))
+    assert len(tiles) == 8 and sum(map(len, tiles)) == len(whole)
+    placed = np.concatenate([tile.center_m + tile.world_xyz_m for tile in tiles])
+    for first, second in ((placed, whole.center_m), (whole.center_m, placed)):
+        assert cKDTree(first).query(second)[0].max() < 2e-3
+    assert sum(int(tile.occupied.sum()) for tile in tiles) == whole.occupied.sum()
+    (path,) = directory.rglob("tileset.json")
+    tileset = json.loads(path.read_text())
+    assert tileset["asset"]["version"] == "1.1" and len(tileset["root"]["children"]) == 8
+    for child in tileset["root"]["children"]:
+        mesh = trimesh.load(path.parent / child["content"]["uri"], force="mesh")  # y up
+        points = np.stack([mesh.vertices[:, 0], -mesh.vertices[:, 2], mesh.vertices[:, 1]], axis=1)
+        middle, half = (
+            np.array(child["boundingVolume"]["box"][:3]),
+            np.array(child["boundingVolume"]["box"])[[3, 7, 11]],
+        )
+        assert (np.abs(points - middle) <= half + 0.05).all()
+        columns = np.array(child["transform"]).reshape(4, 4)
+        world = points @ columns[:3, :3] + columns[3, :3]  # In the frame of the whole scene.
+        box = np.array(tileset["root"]["boundingVolume"]["box"])
+        assert (np.abs(world - box[:3]) <= box[[3, 7, 11]] + 0.05).all()
+
+
 @pytest.mark.slow  # Sampling has the same tests with one block per scene.
 def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_path):
     from jobs.implementation.outpaint_scenes import count_blocks
@@ -251,8 +278,9 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
         made = OutpaintRequest(model, str(tmp_path / name), "street", None, 0, 0.25, "reencode", repaint, 1.0)
         return replace(made, **{"num_blocks": (3, 0, 0, 1), "order": "colours", "batch_size": 2} | options)
 
-    def run(name: str, **options) -> pa.Table:
-        return pa.concat_tables(map(storage.read_parquet, outpaint_scenes(request(name), chosen, **options)))
+    def run(name: str, tile_m: float | None = None, **options) -> pa.Table:
+        tables = outpaint_scenes(request(name, tile_m=tile_m), chosen, **options)
+        return pa.concat_tables(map(storage.read_parquet, tables))
 
     chosen = SceneSubset(str(samples), "generated-samples", None, 1, "first")
     table = run("whole")
@@ -285,6 +313,12 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
         (again,) = read_scenes(str(tmp_path / name))
         for part in ("category", "center_m", "size_m", "height_m", "occupied"):
             assert np.array_equal(getattr(again, part), getattr(whole, part)), (name, part)
+    assert run("tiles", tile_m=64.0, num_actors=2).equals(table)
+    check_tiles(tmp_path / "tiles", whole)
+    lost = sorted((tmp_path / "tiles").rglob("scenes/*/*/part-00001.parquet"))
+    lost[0].unlink()
+    assert run("tiles", tile_m=64.0).equals(table)
+    check_tiles(tmp_path / "tiles", whole)
     (path,) = outpaint_scenes(request("outward", order="outward", num_blocks=(1, 0, 0, 0)), chosen)
     (outward,) = storage.read_parquet(path).to_pylist()[1:]
     assert outward["ahead"] == 1

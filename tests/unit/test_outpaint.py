@@ -20,7 +20,7 @@ from models.composition.outpaint import (
 )
 from models.composition.seam_blending import extract_new_part
 from models.layout import LayoutSpec
-from models.scene import KITTI_GROUND_CLASSES, Grid
+from models.scene import KITTI_GROUND_CLASSES, Grid, make_yaw_rotation
 from models.tensors import make_empty_scene
 
 SPEC = small_spec()
@@ -211,6 +211,40 @@ def test_block_composer_marks_blocks_that_know_only_empty_ground(truth):
 
 
 # ---------------------------------------------------------------------------------------------------------- pipeline
+
+
+@pytest.mark.parametrize(("tile_m", "shape"), [(None, (1, 1)), (64.0, (3, 2)), (96.0, (2, 2)), (100.0, (2, 2))])
+def test_tiles_together_equal_the_whole_scene(truth, tile_m, shape):
+    block_grid = BlockGrid.from_overlap(8, 0.25, rank=rank_four_colors, num_blocks=(1, 1, 0, 1))
+    composer = BlockComposer(block_grid, TRUTH_SPEC, encode_occupancy)
+    blocks = {
+        index: SceneBlock(crop_truth(truth, index, block_grid), torch.zeros(5, 8, 8)) for index in block_grid.indices()
+    }
+    whole = replace(composer.stitch(blocks, EMPTY), world_xyz_m=(5.0, 7.0, 1.0), world_yaw_rad=0.5)
+    tiles = composer.cut_tiles(tile_m)
+    assert composer.find_grid() == whole.grid and (tiles[-1].row + 1, tiles[-1].col + 1) == shape
+    assert sum(tile.grid.rows * tile.grid.cols for tile in tiles) == whole.grid.rows * whole.grid.cols
+    count = 0
+    for tile in tiles:
+        part = composer.stitch({index: blocks[index] for index in tile.blocks}, whole, tile.grid)
+        count += len(part)
+        rows, cols = whole.grid.intersect(tile.grid)[0]
+        assert np.array_equal(part.height_m, whole.height_m[:, rows, cols]) and part.occupied.any()
+        assert np.array_equal(part.occupied, whole.occupied[:, rows, cols])
+        own = tile.to_own_frame(part)
+        assert np.isclose(own.grid.back_m, 0) and np.isclose(own.grid.left_m, -own.grid.right_m)
+        turn = make_yaw_rotation(0.5)  # Both frames give the same places in the world.
+        for scene in (part, own):
+            placed = scene.center_m @ turn.T + scene.world_xyz_m
+            assert np.allclose(placed, part.center_m @ turn.T + whole.world_xyz_m, atol=1e-4)
+    assert count == len(whole)
+
+
+def test_tiles_smaller_than_a_block_or_between_pixels_are_refused():
+    composer = BlockComposer(BlockGrid.from_overlap(8, 0.25), TRUTH_SPEC, encode_occupancy)
+    for tile_m in (0.0, 62.0, 65.0):
+        with pytest.raises(ValueError, match=rf"the side of a tile is {tile_m:g} m, expected at least 64 m and a mult"):
+            composer.cut_tiles(tile_m)
 
 
 def test_label_map_rows_start_far_ahead_and_left():
