@@ -673,22 +673,24 @@ class PrITTIPipeline:
         self,
         labels: Sequence[str],
         seed: int | Sequence[int],
-        indices: Sequence[int],
+        indices: Sequence[SceneKey],
         num_inference_steps: int | None = None,
         guidance_scale: float = 1.0,
         callback_on_step_end: StepCallback | None = None,
         noise_scaling: float | None = None,
+        purpose: int = GENERATE,
     ) -> Float[Tensor, "b c h w"]:
         """Sample latents. Each latent depends only on the seed, its index and its label.
 
         Args:
             labels: Label of each scene.
             seed: One seed for all scenes, or one per scene.
-            indices: Index of each scene within the run.
+            indices: Index of each scene within the run, or another key; the noise depends on the seed and this key.
             num_inference_steps: Number of denoising steps; None: the default of the pipeline.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `generate`.
             noise_scaling: Divisor of the predicted noise; None: the default of the pipeline.
+            purpose: Purpose of the noise: GENERATE, OUTPAINT or INPAINT (models/sampling/diffusion.py).
 
         Returns:
             Latents.
@@ -696,7 +698,7 @@ class PrITTIPipeline:
         Raises:
             ValueError: A label is unknown, a number is out of range, or the scheduler uses fractional timesteps.
         """
-        noise = SceneNoise(seed, indices, self.latent_shape, self.device)
+        noise = SceneNoise(seed, indices, self.latent_shape, self.device, purpose)
         label, noise_scaling = self.label_tensor(labels), self.resolve_noise_scaling(noise_scaling)
         steps: int = self.config.num_inference_steps if num_inference_steps is None else num_inference_steps
         with self._step_callback(steps, callback_on_step_end) as on_step:

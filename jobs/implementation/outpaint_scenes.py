@@ -13,7 +13,8 @@ from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import make_execution, make_repaint_config, select_scenes
-from pipelines.generation.outpaint import HARDLY_KNOWN, OutpaintRequest, outpaint_scenes
+from models.composition.outpaint import HARDLY_KNOWN
+from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
 from pipelines.runtime import storage
 
 BLOCK_M = 64.0  # size of the scenes in every dataset (paper, Sec. 3.1)
@@ -36,6 +37,13 @@ def count_blocks(config: Config) -> tuple[int, int, int, int]:
             )
         sides = [ceil((extent - BLOCK_M) / 2 / step_m - 1e-9) for extent in config.extent_m]
         counts = sides[0], sides[0], sides[1], sides[1]
+        actual = tuple(BLOCK_M + 2 * side * step_m for side in sides)
+        if max(abs(a - b) for a, b in zip(actual, config.extent_m, strict=True)) > 1e-6:
+            wanted = " x ".join(f"{length:g}" for length in config.extent_m)
+            print(
+                f"--extent-m: {wanted} m is no whole number of blocks with --overlap {config.overlap:g}; the result is "
+                f"{actual[0]:g} x {actual[1]:g} m"
+            )
     if min(counts) < 0 or not any(counts):
         raise ValueError(
             f"--blocks-ahead, --blocks-behind, --blocks-left and --blocks-right are {counts}: "
@@ -97,6 +105,7 @@ def main(config: Config) -> None:
     print(f"outpainted scenes, source generated-{config.run}, and GLB files in {output}")
     if bare:
         print(
-            f"{bare} of {count} blocks had almost no known ground, so their outpainting failed, as in the paper; "
-            f"their known_ground is below {HARDLY_KNOWN} in {output}/block_tables/{config.run}/*.parquet"
+            f"{bare} of {count} blocks had almost no known ground (known_ground below {HARDLY_KNOWN} in "
+            f"{output}/block_tables/{config.run}/*.parquet). They were generated without their surroundings; with "
+            "--neighbour-latents paper, they failed, as in the paper"
         )

@@ -85,6 +85,33 @@ class SceneGenerator(Protocol):
         """
         ...
 
+    def sample_latents(
+        self,
+        labels: Sequence[str],
+        seed: int | Sequence[int],
+        indices: Sequence[SceneKey],
+        num_inference_steps: int | None = None,
+        guidance_scale: float = 1.0,
+        callback_on_step_end: StepCallback | None = None,
+        *,
+        purpose: int = ...,
+    ) -> Tensor:
+        """Sample latents with the sampler of the model.
+
+        Args:
+            labels: Label of each scene.
+            seed: Seed of the noise, or one seed per scene.
+            indices: Key of each scene; the noise depends on the seed and this key.
+            num_inference_steps: Number of denoising steps; None: the default of the model.
+            guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
+            callback_on_step_end: See `PrITTIPipeline.generate`.
+            purpose: Purpose of the noise: GENERATE, OUTPAINT or INPAINT (models/sampling/diffusion.py).
+
+        Returns:
+            (b, c, h, w) latents.
+        """
+        ...
+
     def inpaint_latents(
         self,
         condition: InpaintCondition,

@@ -40,6 +40,9 @@ FREE_BLOCKS: dict[str, Callable[[BlockIndex], bool]] = {
     "beside": lambda index: index[1] != 0,
     "all": lambda index: index != (0, 0),
 }
+# A block that knows less ground, as a share of its known pixels, is generated without its surroundings, except with
+# "paper". Otherwise, it would continue the empty surroundings, and so would its neighbours.
+HARDLY_KNOWN = 0.1
 EncodeScenes = Callable[[Sequence[Scene]], Tensor]  # Maps scenes on the model's grid to latents (b, c, h, w).
 
 
@@ -218,7 +221,7 @@ class SceneBlock:
         latent: (c, h, w) latent of the whole block.
         datum_m: Height of the block's frame above the frame of block (0, 0) (metres).
         known_ground: Fraction of the known pixels that have ground; 1 if the block had no known pixels. The paper's
-            outpainting fails if this fraction is near 0.
+            outpainting fails if this fraction is near 0. Below HARDLY_KNOWN, blocks ignore their surroundings.
     """
 
     scene: Scene
@@ -236,12 +239,14 @@ class BlockCondition:
         latent: Latent (c, h, w) of the known part.
         mask: (c, h, w); 1 marks values to generate, 0 marks values to keep.
         datum_m: Height of the block's frame above the frame of block (0, 0) (metres).
+        known_ground: Fraction of the known pixels that have ground; 1 if there are no known pixels.
     """
 
     known: Scene
     latent: Tensor
     mask: Tensor
     datum_m: float
+    known_ground: float
 
     @property
     def is_empty(self) -> bool:
@@ -445,7 +450,9 @@ class BlockComposer:
                 there, here = self.block_grid.overlap_cells(other, index), self.block_grid.overlap_cells(index, other)
                 shared = torch.from_numpy(cells[here]).to(latent.device)
                 latent[:, *here] = torch.where(shared, block.latent[:, *there].to(latent), latent[:, *here])
-        return BlockCondition(known, latent, mask.to(latent).expand_as(latent), datum_m)
+        seen = np.any(known.occupied, axis=0)[~grid.upsample_cells(owned)]
+        known_ground = float(seen.mean()) if len(seen) else 1.0
+        return BlockCondition(known, latent, mask.to(latent).expand_as(latent), datum_m, known_ground)
 
     def finish_block(
         self, condition: BlockCondition, latent: Tensor, generated: Scene, blend: bool = True
@@ -462,8 +469,7 @@ class BlockComposer:
             The block, which contains only the cells that it owns.
         """
         own = extract_new_part(generated, condition.known, condition.new_pixels, blend)
-        seen = np.any(condition.known.occupied, axis=0)[~condition.new_pixels]
-        return SceneBlock(own, latent, condition.datum_m, 1.0 if condition.is_empty else float(seen.mean()))
+        return SceneBlock(own, latent, condition.datum_m, condition.known_ground)
 
     def stitch(self, blocks: Mapping[BlockIndex, SceneBlock], like: Scene, grid: Grid | None = None) -> Scene:
         """Combine blocks into one Scene; each block contributes the cells that it owns.
@@ -569,7 +575,8 @@ def generate_blocks(
         seed: Seed of the noise.
         scene_index: Index of the scene. The noise depends on the seed, this index and the block index.
         mode: One of MODES.
-        repaint: Options of RePaint; None: the options of the paper.
+        repaint: Options of RePaint; None: the options of the paper. They apply to blocks with known surroundings. The
+            others are generated like single scenes, with the sampler of the model.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
 
@@ -584,21 +591,31 @@ def generate_blocks(
         raise ValueError(f"outpainting mode is {mode!r}, expected one of: {', '.join(MODES)}")
     empty = make_empty_scene(like.scene_id, like.source, like.sequence, like.frame, model.spec)
     conditions = [composer.condition_block(index, blocks, empty, mode) for index in indices]
-    stacked = InpaintCondition(torch.stack([c.latent for c in conditions]), torch.stack([c.mask for c in conditions]))
-    repaint = repaint or RePaintConfig()
-    if all(condition.is_empty for condition in conditions):  # Without a known region, resampling has no effect.
-        repaint = replace(repaint, resamplings=1, pseudoinverse_guidance=0.0)
-    latents = model.inpaint_latents(
-        stacked,
-        [label if isinstance(label, str) else label[index] for index in indices],
-        seed,
-        [(scene_index, *index) for index in indices],
-        repaint,
-        guidance_scale,
-        callback_on_step_end,
-        OUTPAINT,
-    )
     as_paper = mode == "paper"
+    labels = [label if isinstance(label, str) else label[index] for index in indices]
+    keys = [(scene_index, *index) for index in indices]
+    alone = [not as_paper and (c.is_empty or c.known_ground < HARDLY_KNOWN) for c in conditions]
+    latents = torch.stack([condition.latent for condition in conditions])
+    if chosen := [k for k, one in enumerate(alone) if one]:  # A new scene, with the sampler of the model.
+        latents[chosen] = model.sample_latents(
+            [labels[k] for k in chosen],
+            seed,
+            [keys[k] for k in chosen],
+            guidance_scale=guidance_scale,
+            callback_on_step_end=callback_on_step_end,
+            purpose=OUTPAINT,
+        )
+    if chosen := [k for k, one in enumerate(alone) if not one]:
+        latents[chosen] = model.inpaint_latents(
+            InpaintCondition(latents[chosen], torch.stack([conditions[k].mask for k in chosen])),
+            [labels[k] for k in chosen],
+            seed,
+            [keys[k] for k in chosen],
+            repaint or RePaintConfig(),
+            guidance_scale,
+            callback_on_step_end,
+            OUTPAINT,
+        )
     scenes = model.decode(latents, [empty] * len(indices), deduplicate=not as_paper, attach=False if as_paper else None)
     parts = zip(indices, conditions, latents, scenes, strict=True)
     return {

@@ -46,7 +46,6 @@ from pipelines.schema.tables import Shard, find_unwritten, require_written
 
 RANKS = {"outward": rank_outward, "colours": rank_four_colors}
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")
-HARDLY_KNOWN = 0.1  # If the fraction of known pixels with ground is smaller, the job prints a warning.
 MAX_RETRIES = 3  # Number of retries for a block whose process died.
 
 

@@ -270,6 +270,21 @@ def test_free_blocks_are_crops_and_the_others_views():
         label_blocks("partial", "low-high", (1, 1, 1, 1), "some")
 
 
+def test_blocks_with_empty_surroundings_are_new_scenes(pipeline, monkeypatch):
+    empty = make_empty_scene("empty", "town", "0", 0, pipeline.spec)
+    given = pipeline.generate(["low"], seed=1, num_inference_steps=5)[0]
+    calls = []
+    sample_latents = pipeline.sample_latents
+    pipeline.register_to_config(num_inference_steps=5)
+    monkeypatch.setattr(pipeline, "sample_latents", lambda *a, **o: calls.append(a[2]) or sample_latents(*a, **o))
+    options = {"seed": 3, "num_blocks": (1, 0, 0, 0), "repaint": QUICK}
+    for scene, mode, expected in ((empty, "reencode", [[(0, 1, 0)]]), (empty, "paper", []), (given, "reencode", [])):
+        calls.clear()
+        larger = pipeline.outpaint(scene, "low", mode=mode, **options)
+        assert calls == expected and larger.grid.rows == 1.5 * scene.grid.rows
+    pipeline.register_to_config(num_inference_steps=250)
+
+
 def test_outpaint_keeps_given_scene_and_takes_label_per_block(pipeline):
     scene = random_scene(2, n=30, grid=SPEC.grid)
     for mode, last in (("copy", (1, 1, 1, 1)), ("reencode", (1, 0, 0, 2))):
