@@ -240,7 +240,7 @@ def test_tiles_together_equal_the_whole_scene(truth, tile_m, shape):
     assert count == len(whole)
 
 
-def test_tiles_smaller_than_a_block_or_between_pixels_are_refused():
+def test_tiles_below_a_block_or_between_pixels_are_refused():
     composer = BlockComposer(BlockGrid.from_overlap(8, 0.25), TRUTH_SPEC, encode_occupancy)
     for tile_m in (0.0, 62.0, 65.0):
         with pytest.raises(ValueError, match=rf"the side of a tile is {tile_m:g} m, expected at least 64 m and a mult"):
