@@ -11,7 +11,8 @@
 
 By default, the job adds eight blocks around a scene, as in the paper: four sides in one batch, then four corners. The
 job writes scene tables with source=generated-<run> and one GLB file per scene. With --tile-m, it writes one scene and
-one GLB file per tile, and a 3D Tiles tileset, glb/<run>/<scene>/tileset.json. No process then holds a whole city.
+one GLB file per tile, a 3D Tiles tileset, glb/<run>/<scene>/tileset.json, and a page on which a camera flies over the
+city, pages/<run>/<scene>/index.html. No process then holds a whole city.
 
 The tables in block_tables/ contain the share of known ground in each block. The job generates a block as soon as all
 neighbours that the block depends on are complete. The result does not depend on the number of actors. Run the same

@@ -39,6 +39,7 @@ from pipelines.generation.sample import (
 )
 from pipelines.io.mesh_export import export_glb
 from pipelines.io.tileset import TileContent, find_tile_bounds, make_tileset
+from pipelines.reporting.city_page import pack_tile, render_city_html
 from pipelines.runtime import storage
 from pipelines.runtime.resources import make_model_resources, require_room
 from pipelines.schema.scene_subset import SceneSubset
@@ -324,6 +325,8 @@ class Outpainter:
             part = make_tile_name(tile)
             bounds = find_tile_bounds(scene)  # In the frame of the input scene.
             storage.write_json(bounds, storage.join_uri(request.output, "glb", request.run, name, f"{part}.json"))
+            page = make_page_path(request, task.number, "tiles", f"{part}.js")
+            storage.write_text(pack_tile(part, scene), page)
             scene, name, path = tile.to_own_frame(scene), f"{name}-{part}", f"{name}/{part}.glb"
         scene = replace(scene, scene_id=name, source=request.source, split="generated", frame=task.number)
         path = storage.join_uri(request.output, "glb", request.run, path)
@@ -344,12 +347,14 @@ class Outpainter:
             about = {"datum_m": block.datum_m, "known_ground": block.known_ground}
             rows.append({"scene_id": name, "ahead": index[0], "left": index[1], **about})
         if request.tile_m is not None:
-            tiles, place = [], storage.join_uri(request.output, "glb", request.run, name)
+            tiles, grids, place = [], {}, storage.join_uri(request.output, "glb", request.run, name)
             for tile in composer.cut_tiles(request.tile_m):
                 part = make_tile_name(tile)
+                grids[part] = tile.grid
                 low_m, high_m = storage.read_json(storage.join_uri(place, f"{part}.json"))
                 tiles.append(TileContent(part, low_m, high_m, tile.origin_m))
             storage.write_json(make_tileset(tiles), storage.join_uri(place, "tileset.json"))
+            storage.write_text(render_city_html(name, grids), make_page_path(request, number, "index.html"))
         storage.write_parquet(pa.Table.from_pylist(rows), make_blocks_table_path(request, number))
         storage.delete_directory(request.blocks_directory(number))
 
@@ -364,6 +369,20 @@ def make_tile_name(tile: Tile) -> str:
         Name.
     """
     return f"{tile.row:03d}-{tile.col:03d}"
+
+
+def make_page_path(request: OutpaintRequest, number: int, *parts: str) -> str:
+    """Return the path of a file of the page of a scene in tiles.
+
+    Args:
+        request: Options of outpainting.
+        number: Number of the scene in the run.
+        *parts: Parts of the path below the directory of the page.
+
+    Returns:
+        Path of the file.
+    """
+    return storage.join_uri(request.output, "pages", request.run, request.scene_id(number), *parts)
 
 
 def make_blocks_table_path(request: OutpaintRequest, number: int) -> str:

@@ -5,7 +5,7 @@
 //
 // Dragging rotates the view. Dragging with the right button or with two fingers moves the view. The wheel zooms.
 
-const CUBE = cube(), BALL = ball(24, 16);
+const CUBE = cube(), BALL = ball(24, 16), COARSE_BALL = ball(10, 6);
 const SUN = normalised([0.45, -0.5, 0.78]);
 const SHADOW_PX = 2048;
 
@@ -64,6 +64,8 @@ export class Viewer {
     this.program = linked(gl, VERTEX, FRAGMENT);
     this.depth = linked(gl, VERTEX, DEPTH);
     this.parts = [];
+    this.focus = { middle: [32, 0, 0], reach: 50 };  // Area with shadows (m).
+    this.onmove = () => {};
     this.camera = { target: [32, 0, 0], distance: 75, azimuth: Math.PI, elevation: 0.75 };
     this.shadow = shadowMap(gl);
     this.chosen = -1;
@@ -74,8 +76,7 @@ export class Viewer {
 
   // Replace the scene. The camera changes only if the grid changes.
   async show(scene) {
-    const gl = this.gl, grid = scene.grid;
-    const key = JSON.stringify(grid);
+    const grid = scene.grid, key = JSON.stringify(grid);
     if (key !== this.grid) {
       this.grid = key;
       const length = grid.rows * grid.resolution_m, width = grid.cols * grid.resolution_m;
@@ -83,15 +84,28 @@ export class Viewer {
       this.camera.distance = 1.15 * Math.max(length, width);
     }
     this.scene = scene;
-    for (const part of this.parts) part.free();
-    const texture = await picture(gl, scene.ground.picture);
-    this.parts = [terrain(gl, scene.ground, grid, texture)];
-    for (const kind of [0, 1]) {
-      const numbers = scene.primitives.map((p, i) => i).filter((i) => scene.primitives[i].ellipsoid === (kind === 1));
-      if (numbers.length) this.parts.push(instances(gl, kind, numbers, scene.primitives));
-    }
+    const made = await this.add(scene);
+    this.remove(this.parts.filter((part) => !made.includes(part)));
+    this.focus = focus(grid);
     this.heights = scene.primitives.map((p) => p.center_m[2]);
     this.draw();
+  }
+
+  // Add a scene to those that are shown, and return its parts. Coarse ellipsoids have fewer faces.
+  async add(scene, coarse = false) {
+    const gl = this.gl, texture = await picture(gl, scene.ground.picture), made = [terrain(gl, scene.ground, scene.grid, texture)];
+    for (const kind of [0, 1]) {
+      const numbers = scene.primitives.map((p, i) => i).filter((i) => scene.primitives[i].ellipsoid === (kind === 1));
+      if (numbers.length) made.push(instances(gl, kind, numbers, scene.primitives, coarse));
+    }
+    this.parts = [...this.parts, ...made];
+    return made;
+  }
+
+  // Remove the parts of a scene.
+  remove(parts) {
+    this.parts = this.parts.filter((part) => !parts.includes(part));
+    for (const part of parts) part.free();
   }
 
   choose(index) { this.chosen = index; for (const part of this.parts) part.mark?.(index); this.draw(); }
@@ -116,9 +130,8 @@ export class Viewer {
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (!width || !height) return;
     if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
-    const { eye, seen } = this.matrices(), g = this.scene?.grid;
-    const reach = g ? 0.75 * Math.hypot(g.rows, g.cols) * g.resolution_m : 50;
-    const middle = g ? [g.front_m - (g.rows * g.resolution_m) / 2, g.left_m - (g.cols * g.resolution_m) / 2, 0] : [32, 0, 0];
+    this.onmove();
+    const { eye, seen } = this.matrices(), { middle, reach } = this.focus;
     const lit = times(parallel(reach), looking(middle.map((m, i) => m + reach * SUN[i]), middle));
     gl.enable(gl.DEPTH_TEST);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.shadow.frame);
@@ -206,6 +219,12 @@ export class Viewer {
 
 // ------------------------------------------------------------------------------------------------------- geometry
 
+// Return the area of a grid: its middle, and a radius with which shadows reach beyond it.
+function focus(grid) {
+  const { front_m, left_m, rows, cols, resolution_m } = grid;
+  return { middle: [front_m - (rows * resolution_m) / 2, left_m - (cols * resolution_m) / 2, 0], reach: 0.75 * Math.hypot(rows, cols) * resolution_m };
+}
+
 function cube() {
   const corners = [], normals = [];
   for (const axis of [0, 1, 2]) for (const side of [-1, 1]) {
@@ -245,8 +264,8 @@ function columns(p) {
   return [...found, [...p.center_m, 1]];
 }
 
-function instances(gl, kind, numbers, primitives) {
-  const shape = kind ? BALL : CUBE, vao = gl.createVertexArray(), data = [0, 1, 2, 3].map(() => new Float32Array(4 * numbers.length));
+function instances(gl, kind, numbers, primitives, coarse) {
+  const shape = kind ? (coarse ? COARSE_BALL : BALL) : CUBE, vao = gl.createVertexArray(), data = [0, 1, 2, 3].map(() => new Float32Array(4 * numbers.length));
   const paint = new Float32Array(4 * numbers.length), row = new Map(numbers.map((number, k) => [number, k]));
   const fill = (k, p) => columns(p).forEach((column, c) => data[c].set(column, 4 * k));
   numbers.forEach((number, k) => { fill(k, primitives[number]); paint.set([...linear(primitives[number].color), 1], 4 * k); });
