@@ -27,6 +27,7 @@ def write_city(directory, count: int) -> None:
 
 def test_city_page_loads_near_tiles_and_flies(tmp_path, browser):
     write_city(tmp_path, 8)
+    browser.set_window_size(500, 400)  # Software rendering of large pages is slow.
     browser.get((tmp_path / "index.html").as_uri())
     count = "document.getElementById('count').textContent"
     # The camera starts in the middle, at 512 m, with a reach of 360 m: all tiles but the first and the last.
