@@ -247,6 +247,11 @@ def check_tiles(directory, whole: Scene) -> None:
     for first, second in ((placed, whole.center_m), (whole.center_m, placed)):
         assert cKDTree(first).query(second)[0].max() < 2e-3
     assert sum(int(tile.occupied.sum()) for tile in tiles) == whole.occupied.sum()
+    (page,) = directory.glob("pages/street/*/index.html")
+    names = [
+        tile["name"] for tile in json.loads(page.read_text().split('id="data">')[1].split("</script>")[0])["tiles"]
+    ]
+    assert sorted(file.stem for file in (page.parent / "tiles").iterdir()) == sorted(names) and len(names) == 8
     (path,) = directory.rglob("tileset.json")
     tileset = json.loads(path.read_text())
     assert tileset["asset"]["version"] == "1.1" and len(tileset["root"]["children"]) == 8
