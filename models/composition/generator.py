@@ -28,6 +28,11 @@ class SceneGenerator(Protocol):
         ...
 
     @property
+    def uses_ddpm(self) -> bool:
+        """True if the sampler of the model is that of the paper (DDPM)."""
+        ...
+
+    @property
     def latent_shape(self) -> tuple[int, int, int]:
         """Shape (c, h, w) of a latent."""
         ...

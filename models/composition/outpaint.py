@@ -576,7 +576,8 @@ def generate_blocks(
         scene_index: Index of the scene. The noise depends on the seed, this index and the block index.
         mode: One of MODES.
         repaint: Options of RePaint; None: the options of the paper. They apply to blocks with known surroundings. The
-            others are generated like single scenes, with the sampler of the model.
+            others are generated like single scenes, with the sampler of the model; if it is DDPM, with the steps of
+            `repaint`.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
 
@@ -596,25 +597,23 @@ def generate_blocks(
     keys = [(scene_index, *index) for index in indices]
     alone = [not as_paper and (c.is_empty or c.known_ground < HARDLY_KNOWN) for c in conditions]
     latents = torch.stack([condition.latent for condition in conditions])
-    if chosen := [k for k, one in enumerate(alone) if one]:  # A new scene, with the sampler of the model.
-        latents[chosen] = model.sample_latents(
-            [labels[k] for k in chosen],
-            seed,
-            [keys[k] for k in chosen],
-            guidance_scale=guidance_scale,
-            callback_on_step_end=callback_on_step_end,
-            purpose=OUTPAINT,
-        )
-    if chosen := [k for k, one in enumerate(alone) if not one]:
+    repaint = repaint or RePaintConfig()
+    for new in (True, False):
+        chosen = [k for k, one in enumerate(alone) if one == new]
+        if not chosen:
+            continue
+        names, chosen_keys = [labels[k] for k in chosen], [keys[k] for k in chosen]
+        if new and not model.uses_ddpm:  # With DDPM, fewer steps than the model's would lose objects.
+            latents[chosen] = model.sample_latents(
+                names, seed, chosen_keys, None, guidance_scale, callback_on_step_end, purpose=OUTPAINT
+            )
+            continue
+        mask, options = torch.stack([conditions[k].mask for k in chosen]), repaint
+        if new:  # Without a known region, resampling has no effect.
+            mask, options = torch.ones_like(mask), replace(repaint, resamplings=1, pseudoinverse_guidance=0.0)
+        condition = InpaintCondition(latents[chosen], mask)
         latents[chosen] = model.inpaint_latents(
-            InpaintCondition(latents[chosen], torch.stack([conditions[k].mask for k in chosen])),
-            [labels[k] for k in chosen],
-            seed,
-            [keys[k] for k in chosen],
-            repaint or RePaintConfig(),
-            guidance_scale,
-            callback_on_step_end,
-            OUTPAINT,
+            condition, names, seed, chosen_keys, options, guidance_scale, callback_on_step_end, OUTPAINT
         )
     scenes = model.decode(latents, [empty] * len(indices), deduplicate=not as_paper, attach=False if as_paper else None)
     parts = zip(indices, conditions, latents, scenes, strict=True)

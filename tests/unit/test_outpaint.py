@@ -275,6 +275,7 @@ def test_blocks_with_empty_surroundings_are_new_scenes(pipeline, monkeypatch):
     given = pipeline.generate(["low"], seed=1, num_inference_steps=5)[0]
     calls = []
     sample_latents = pipeline.sample_latents
+    pipeline.use_sampler("dpm++")
     pipeline.register_to_config(num_inference_steps=5)
     monkeypatch.setattr(pipeline, "sample_latents", lambda *a, **o: calls.append(a[2]) or sample_latents(*a, **o))
     options = {"seed": 3, "num_blocks": (1, 0, 0, 0), "repaint": QUICK}
@@ -282,7 +283,10 @@ def test_blocks_with_empty_surroundings_are_new_scenes(pipeline, monkeypatch):
         calls.clear()
         larger = pipeline.outpaint(scene, "low", mode=mode, **options)
         assert calls == expected and larger.grid.rows == 1.5 * scene.grid.rows
-    pipeline.register_to_config(num_inference_steps=250)
+    pipeline.use_sampler("ddpm")  # DDPM needs many steps, so it uses those of the options.
+    calls.clear()
+    larger = pipeline.outpaint(empty, "low", mode="reencode", **options)
+    assert not calls and pipeline.config.num_inference_steps == 250
 
 
 def test_outpaint_keeps_given_scene_and_takes_label_per_block(pipeline):
