@@ -54,9 +54,10 @@ class Config(RePaintOptions):
     labels_map: str = ""
     """JSON file with one list per row of blocks, farthest ahead first, each with one label per block, leftmost first;
     replaces --label."""
-    free_blocks: Literal["none", "beside", "all"] = "none"
-    """Blocks that are sampled as crops at any place and heading, instead of views of a vehicle: those beside the street
-    of the given scene (beside), or all blocks. Only models with labels such as low-medium-free distinguish both."""
+    free_blocks: Literal["none", "off-street", "all"] = "none"
+    """Blocks that are sampled as crops at any place and heading, instead of views of a vehicle: those that do not lie
+    ahead of or behind the given scene (off-street), or all blocks. Only models with labels such as low-medium-free
+    distinguish both."""
     tile_m: float | None = None
     """Side of the tiles in metres, at least 64 (default: each result is written as one scene)."""
     neighbour_latents: Literal["reencode", "copy", "paper"] | None = None

@@ -37,19 +37,21 @@ def count_blocks(config: Config) -> tuple[int, int, int, int]:
             )
         sides = [ceil((extent - BLOCK_M) / 2 / step_m - 1e-9) for extent in config.extent_m]
         counts = sides[0], sides[0], sides[1], sides[1]
-        actual = tuple(BLOCK_M + 2 * side * step_m for side in sides)
-        if max(abs(a - b) for a, b in zip(actual, config.extent_m, strict=True)) > 1e-6:
-            wanted = " x ".join(f"{length:g}" for length in config.extent_m)
-            print(
-                f"--extent-m: {wanted} m is no whole number of blocks with --overlap {config.overlap:g}; the result is "
-                f"{actual[0]:g} x {actual[1]:g} m"
-            )
     if min(counts) < 0 or not any(counts):
         raise ValueError(
             f"--blocks-ahead, --blocks-behind, --blocks-left and --blocks-right are {counts}: "
             "expected numbers of at least 0, and at least one block"
         )
     return counts
+
+
+def report_extent(config: Config, counts: tuple[int, int, int, int]) -> None:
+    """Print the size of the result if it differs from --extent-m."""
+    step_m = BLOCK_M * (1 - config.overlap)
+    actual = tuple(BLOCK_M + (a + b) * step_m for a, b in (counts[:2], counts[2:]))
+    if config.extent_m and max(abs(a - b) for a, b in zip(actual, config.extent_m, strict=True)) > 1e-6:
+        wanted, made = (" x ".join(f"{length:g}" for length in size) for size in (config.extent_m, actual))
+        print(f"--extent-m: {wanted} m is no whole number of blocks; the result is {made} m")
 
 
 def read_labels_map(path: str) -> tuple[tuple[str, ...], ...]:
@@ -69,6 +71,7 @@ def read_labels_map(path: str) -> tuple[tuple[str, ...], ...]:
 def outpaint(config: Config) -> list[str]:
     """Extend scenes and write them; return the path of each scene's table with the known ground in each block."""
     counts = count_blocks(config)
+    report_extent(config, counts)
     check_outpaint_scenes(config)
     selection = select_scenes(config)
     count = sum(len(rows) for _, rows in selection.shards())

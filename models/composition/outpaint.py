@@ -34,10 +34,10 @@ BlockIndex = tuple[int, int]  # (i, j): i steps ahead of block (0, 0), j steps t
 # How a block uses its neighbours. "reencode" and "copy" differ in the known latents (`BlockComposer.condition_block`);
 # both blend the ground and remove duplicates. "paper" copies the latents and does neither.
 MODES = ("reencode", "copy", "paper")
-# Blocks that count as crops at any place and heading: none, those beside the street of block (0, 0), or all others.
+# Blocks that count as crops at any place and heading: none, those off the street of block (0, 0), or all but it.
 FREE_BLOCKS: dict[str, Callable[[BlockIndex], bool]] = {
     "none": lambda index: False,
-    "beside": lambda index: index[1] != 0,
+    "off-street": lambda index: index[1] != 0,
     "all": lambda index: index != (0, 0),
 }
 # A block that knows less ground, as a share of its known pixels, is generated without its surroundings, except with
@@ -339,18 +339,23 @@ class BlockComposer:
         """Distance between neighbouring blocks in metres."""
         return self.step_px * self.spec.grid.resolution_m
 
-    def find_grid(self) -> Grid:
-        """Return the pixel grid of all blocks of a bounded block grid, in the frame of block (0, 0)."""
-        indices, small = self.block_grid.indices(), self.spec.grid
-        (behind, right), (ahead, left) = (
-            tuple(pick(index[k] for index in indices) for k in (0, 1)) for pick in (min, max)
-        )
+    def find_grid(self, indices: Iterable[BlockIndex]) -> Grid:
+        """Return the pixel grid of blocks.
+
+        Args:
+            indices: Indices of the blocks.
+
+        Returns:
+            Smallest grid that covers the blocks, in the frame of block (0, 0).
+        """
+        rows, cols = zip(*indices, strict=True)
+        small = self.spec.grid
         return replace(
             small,
-            front_m=small.front_m + ahead * self.step_m,
-            left_m=small.left_m + left * self.step_m,
-            rows=small.rows + (ahead - behind) * self.step_px,
-            cols=small.cols + (left - right) * self.step_px,
+            front_m=small.front_m + max(rows) * self.step_m,
+            left_m=small.left_m + max(cols) * self.step_m,
+            rows=small.rows + (max(rows) - min(rows)) * self.step_px,
+            cols=small.cols + (max(cols) - min(cols)) * self.step_px,
         )
 
     def cut_tiles(self, tile_m: float | None = None) -> list[Tile]:
@@ -365,7 +370,8 @@ class BlockComposer:
         Raises:
             ValueError: The side is no multiple of the pixel size, or is smaller than a block.
         """
-        whole, small, pixel_m = self.find_grid(), self.spec.grid, self.spec.grid.resolution_m
+        whole, small = self.find_grid(self.block_grid.indices()), self.spec.grid
+        pixel_m = small.resolution_m
         side = max(whole.rows, whole.cols) if tile_m is None else round(tile_m / pixel_m)
         if tile_m is not None and (side < small.rows or abs(side * pixel_m - tile_m) > 1e-6):
             raise ValueError(
@@ -483,16 +489,7 @@ class BlockComposer:
             The combined scene.
         """
         small = self.spec.grid
-        if grid is None:
-            ahead, left = (max(index[k] for index in blocks) for k in (0, 1))
-            behind, right = (-min(index[k] for index in blocks) for k in (0, 1))
-            grid = replace(
-                small,
-                front_m=small.front_m + ahead * self.step_m,
-                left_m=small.left_m + left * self.step_m,
-                rows=small.rows + (ahead + behind) * self.step_px,
-                cols=small.cols + (left + right) * self.step_px,
-            )
+        grid = self.find_grid(blocks) if grid is None else grid
         shape = (len(self.spec.ground_classes), grid.rows, grid.cols)
         height, occupied, objects = np.zeros(shape, np.float32), np.zeros(shape, bool), []
         for index, block in sorted(blocks.items()):

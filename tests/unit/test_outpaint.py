@@ -222,7 +222,7 @@ def test_tiles_together_equal_the_whole_scene(truth, tile_m, shape):
     }
     whole = replace(composer.stitch(blocks, EMPTY), world_xyz_m=(5.0, 7.0, 1.0), world_yaw_rad=0.5)
     tiles = composer.cut_tiles(tile_m)
-    assert composer.find_grid() == whole.grid and (tiles[-1].row + 1, tiles[-1].col + 1) == shape
+    assert composer.find_grid(blocks) == whole.grid and (tiles[-1].row + 1, tiles[-1].col + 1) == shape
     assert sum(tile.grid.rows * tile.grid.cols for tile in tiles) == whole.grid.rows * whole.grid.cols
     count = 0
     for tile in tiles:
@@ -261,12 +261,15 @@ def test_label_map_rows_start_far_ahead_and_left():
 
 def test_free_blocks_are_crops_and_the_others_views():
     assert set(label_blocks("partial", "low-high", (1, 1, 1, 1)).values()) == {"low-high"}
-    beside = label_blocks("partial", "low-high", (1, 1, 1, 1), "beside")
-    assert {index for index, label in beside.items() if label == "low-high-free"} == set(CORNERS) | {(0, 1), (0, -1)}
+    off_street = label_blocks("partial", "low-high", (1, 1, 1, 1), "off-street")
+    assert {index for index, label in off_street.items() if label == "low-high-free"} == set(CORNERS) | {
+        (0, 1),
+        (0, -1),
+    }
     everywhere = label_blocks("partial", "low-high", (1, 1, 1, 1), "all")
     assert [index for index, label in everywhere.items() if label == "low-high"] == [(0, 0)]
     assert set(label_blocks("joint", "low-high", (1, 1, 1, 1), "all").values()) == {"low-high"}  # joint has no crops
-    with pytest.raises(ValueError, match="free_blocks is 'some', expected one of: none, beside, all"):
+    with pytest.raises(ValueError, match="free_blocks is 'some', expected one of: none, off-street, all"):
         label_blocks("partial", "low-high", (1, 1, 1, 1), "some")
 
 
