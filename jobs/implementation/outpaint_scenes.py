@@ -9,11 +9,11 @@ from rich.progress import MofNCompleteColumn, Progress
 from jobs.implementation.checks import check_outpaint_scenes
 from jobs.outpaint_scenes import Config
 from jobs.support.cli import make_absolute
-from jobs.support.model_directories import find_pipeline_directory
+from jobs.support.model_directories import find_pipeline_directory, read_label_kind
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import make_execution, make_repaint_config, select_scenes
-from models.composition.outpaint import HARDLY_KNOWN
+from models.composition.outpaint import HARDLY_KNOWN, label_blocks
 from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
 from pipelines.runtime import storage
 
@@ -54,17 +54,22 @@ def report_extent(config: Config, counts: tuple[int, int, int, int]) -> None:
         print(f"--extent-m: {wanted} m is no whole number of blocks; the result is {made} m")
 
 
-def read_labels_map(path: str) -> tuple[tuple[str, ...], ...]:
+def read_labels_map(path: str, kind: str, counts: tuple[int, int, int, int]) -> tuple[tuple[str, ...], ...]:
     """Return the labels of a map, row by row.
 
     Raises:
-        ValueError: The file does not hold lists of labels.
+        ValueError: The file does not hold lists of labels, a label is unknown to models with this kind of label, or the
+            map has another size than the city.
     """
     rows = storage.read_json(make_absolute(path))
     if not isinstance(rows, list) or not all(
         isinstance(row, list) and all(isinstance(name, str) for name in row) for row in rows
     ):
         raise ValueError(f'--labels-map {path}: expected lists of labels, such as [["low-low", "low-high"]]')
+    try:
+        label_blocks(kind, rows, counts)
+    except ValueError as error:
+        raise ValueError(f"--labels-map {path}: {error}") from error
     return tuple(tuple(row) for row in rows)
 
 
@@ -73,14 +78,14 @@ def outpaint(config: Config) -> list[str]:
     counts = count_blocks(config)
     report_extent(config, counts)
     check_outpaint_scenes(config)
-    selection = select_scenes(config)
+    selection, model = select_scenes(config), find_pipeline_directory(config.model)
     count = sum(len(rows) for _, rows in selection.shards())
     request = OutpaintRequest(
-        model=find_pipeline_directory(config.model),
+        model=model,
         output=config.output_directory(),
         run=config.run,
         label=config.label or None,
-        labels_map=read_labels_map(config.labels_map) if config.labels_map else None,
+        labels_map=read_labels_map(config.labels_map, read_label_kind(model), counts) if config.labels_map else None,
         free_blocks=config.free_blocks,
         tile_m=config.tile_m,
         seed=config.seed,
@@ -106,6 +111,8 @@ def main(config: Config) -> None:
     known = [storage.read_parquet(path, ["known_ground"])["known_ground"].to_numpy() for path in tables]
     bare, count = sum(int((share < HARDLY_KNOWN).sum()) for share in known), sum(map(len, known))
     print(f"outpainted scenes, source generated-{config.run}, and GLB files in {output}")
+    if config.tile_m is not None:
+        print(f"pages that fly over the cities: {output}/pages/{config.run}/*/index.html")
     if bare:
         print(
             f"{bare} of {count} blocks had almost no known ground (known_ground below {HARDLY_KNOWN} in "

@@ -535,7 +535,7 @@ def label_blocks(
     if len(labels) != rows or any(len(row) != cols for row in labels):
         found = " and ".join(str(width) for width in sorted({len(row) for row in labels}))
         raise ValueError(
-            f"the label map has {len(labels)} rows with {found or 'no'} labels, but the city has {rows} rows with "
+            f"the number of rows is {len(labels)}, with {found or 'no'} labels per row; the city has {rows} rows with "
             f"{cols} blocks each"
         )
     require_labels(kind, {name for row in labels for name in row})

@@ -419,8 +419,7 @@ def outpaint_scenes(
         Path of the table of blocks of each scene (`make_blocks_table_path`), in order.
 
     Raises:
-        ValueError: The output contains a run of the same name with other options, the label map has another size than
-            the scenes, or the side of the tiles is invalid.
+        ValueError: The output contains a run of the same name with other options, or the side of the tiles is invalid.
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
@@ -429,8 +428,6 @@ def outpaint_scenes(
         mode=request.mode or pipeline.config.neighbour_latents,
         constraints=pipeline.resolve_constraints(request.constraints),
     )
-    if request.labels_map:  # Raise an error before actors start.
-        label_blocks(pipeline.dit.config.label, request.labels_map, request.num_blocks)
     block_grid = request.make_block_grid(pipeline.latent_shape[-1])
     parts = [storage.join_uri(request.output, "blocks", request.run)]
     guard_generation_run(request, pipeline, parts, input=asdict(selection), scenes=selection.files())

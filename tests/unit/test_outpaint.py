@@ -251,9 +251,11 @@ def test_label_map_rows_start_far_ahead_and_left():
     rows = [["low-low", "low-medium", "low-high"], ["high-low", "high-medium", "high-high"]]
     labels = label_blocks("partial", rows, (1, 0, 1, 1))
     assert [labels[1, j] for j in (1, 0, -1)] == rows[0] and [labels[0, j] for j in (1, 0, -1)] == rows[1]
-    with pytest.raises(ValueError, match="the label map has 2 rows with 3 labels, but the city has 3 rows with 3"):
+    with pytest.raises(ValueError, match="the number of rows is 2, with 3 labels per row; the city has 3 rows with 3"):
         label_blocks("partial", rows, (1, 1, 1, 1))
-    with pytest.raises(ValueError, match="2 rows with 2 and 3 labels, but the city has 2 rows with 3 blocks each"):
+    with pytest.raises(
+        ValueError, match="rows is 2, with 2 and 3 labels per row; the city has 2 rows with 3 blocks each"
+    ):
         label_blocks("partial", [rows[0], rows[1][:2]], (1, 0, 1, 1))
     with pytest.raises(ValueError, match="label 'lots' is unknown"):
         label_blocks("partial", [["lots"]], (0, 0, 0, 0))
