@@ -63,6 +63,9 @@ class Config:
     """Number of warm-up steps with a linear increase of the learning rate (default: as in the preset)."""
     prediction_type: Literal["epsilon", "v_prediction"] | None = None
     """Target that the network predicts (default: as in the preset; paper: epsilon)."""
+    inpainting: bool | None = None
+    """Train the network to continue random known parts of a scene, which makes inpainting and outpainting better and
+    faster (default: as in the preset; paper: False)."""
     normalise_latents: bool | None = None
     """Normalise each latent channel to mean 0 and standard deviation 1 (default: as in the preset; paper: False)."""
     sample_posterior: bool | None = None

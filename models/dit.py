@@ -22,7 +22,7 @@ from models.base import ConfiguredModel, apply_in_float32, register_computed_buf
 from models.labels import LABELS
 from models.layout import LayoutSpec
 from models.limits import require_within
-from models.options import FINITE, LARGE, Choice, Integer, Number, Rule, Sequential, check_entries
+from models.options import FINITE, LARGE, Choice, Flag, Integer, Number, Rule, Sequential, check_entries
 from models.sampling.diffusion import PAPER_SCHEDULE, Denoiser, Diffusion
 
 FREQUENCIES = 256
@@ -42,6 +42,7 @@ RULES: dict[str, Rule] = {
     "shift": Sequential(FINITE, 1, MAX_CHANNELS),
     "scale": Sequential(Number(1e-6, LARGE), 1, MAX_CHANNELS),
     "prediction": Choice(get_args(Prediction)),
+    "inpainting": Flag(),
 }
 SCHEDULE_RULES: dict[str, Rule] = {
     "num_timesteps": Integer(1, 2**31),
@@ -152,6 +153,8 @@ class DiT(ConfiguredModel):
         prediction: Output of the network. "epsilon" is the noise, as in the paper. "v_prediction" is sqrt(alpha_bar)
             noise - sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), which `forward` converts to the noise. With
             "v_prediction", a small network does not need to pass the noise of its input through all layers.
+        inpainting: Whether the network also receives the known part of the clean latent (`join_known`), as the
+            inpainting model of Rombach et al. (2022). The paper's network does not; it inpaints with RePaint.
 
     Raises:
         ValueError: `prediction` is unknown, `patch` does not divide `size`, or `heads` does not divide `width`.
@@ -176,6 +179,7 @@ class DiT(ConfiguredModel):
         scale: Sequence[float] | None = None,
         prediction: Prediction | str = "epsilon",
         schedule: Diffusion = PAPER_SCHEDULE,
+        inpainting: bool = False,
     ) -> None:
         super().__init__()
         if prediction not in get_args(Prediction):
@@ -183,6 +187,8 @@ class DiT(ConfiguredModel):
         if size % patch or width % heads or width % 4:
             raise ValueError(f"DiT: patch {patch} must divide size {size}, and heads {heads} must divide width {width}")
         self.patch_in = nn.Conv2d(channels, width, patch, stride=patch)
+        # Without a bias, an empty known part adds nothing.
+        self.known_in = nn.Conv2d(2 * channels, width, patch, stride=patch, bias=False) if inpainting else None
         self.timestep_mlp = nn.Sequential(nn.Linear(FREQUENCIES, width), nn.SiLU(), nn.Linear(width, width))
         self.label_embedding = nn.Embedding(num_labels + 1, width)
         self.blocks = nn.ModuleList(DiTBlock(width, heads) for _ in range(depth))
@@ -261,6 +267,8 @@ class DiT(ConfiguredModel):
         first, _, second = self.timestep_mlp
         for layer in (self.label_embedding, first, second):
             nn.init.normal_(cast(Tensor, layer.weight), std=0.02)
+        if self.known_in is not None:  # At first, the network ignores the known part.
+            nn.init.zeros_(self.known_in.weight)
         for layer in (*self.list_modulations(), self.patch_out):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
@@ -324,12 +332,12 @@ class DiT(ConfiguredModel):
         return self.noise_shares[timestep, 1] ** -2
 
     def forward(
-        self, latent: Float[Tensor, "batch c h w"], timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]
+        self, latent: Float[Tensor, "batch c_in h w"], timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]
     ) -> Float[Tensor, "batch c h w"]:
         """Predict the noise in latents.
 
         Args:
-            latent: Noisy latents.
+            latent: Noisy latents of c channels; or of 3 c channels, with a known part (`join_known`).
             timestep: Timesteps.
             label: Class indices.
 
@@ -370,7 +378,7 @@ class DiT(ConfiguredModel):
         return denoise
 
     def apply_modulations(
-        self, latent: Float[Tensor, "batch c h w"], modulations: Sequence[Tensor], pag_scale: float = 0.0
+        self, latent: Float[Tensor, "batch c_in h w"], modulations: Sequence[Tensor], pag_scale: float = 0.0
     ) -> Float[Tensor, "batch c h w"]:
         """Predict the noise in latents with precomputed modulations.
 
@@ -379,15 +387,23 @@ class DiT(ConfiguredModel):
         attends only to itself. Both networks share the blocks before, so the guidance costs half an evaluation.
 
         Args:
-            latent: Noisy latents.
+            latent: Noisy latents, with or without a known part (see `forward`).
             modulations: Output of the method `modulations`.
             pag_scale: Scale of perturbed-attention guidance; 0 switches it off.
 
         Returns:
             Predicted noise.
+
+        Raises:
+            ValueError: The latents have a known part, but the network was built without `inpainting`.
         """
         patch, tokens = self.config.patch, self.config.size // self.config.patch
+        latent, known = latent.split([self.config.channels, latent.shape[1] - self.config.channels], dim=1)
         x = apply_in_float32(self.patch_in, latent).flatten(2).transpose(1, 2) + self.positions  # (b, n, d)
+        if known.shape[1]:
+            if self.known_in is None:
+                raise ValueError("this transformer was trained without --inpainting, so it cannot read a known part")
+            x = x + apply_in_float32(self.known_in, known).flatten(2).transpose(1, 2)
         *of_blocks, of_output, shares = modulations
         for number, (block, modulation) in enumerate(zip(self.blocks, of_blocks, strict=True)):
             if pag_scale and number == len(self.blocks) // 2:

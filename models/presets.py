@@ -112,6 +112,7 @@ class DiTConfig:
         width: Width of the tokens.
         heads: Number of attention heads.
         prediction: Output of the network: "epsilon", as in the paper, or "v_prediction".
+        inpainting: Whether the network is trained to continue known parts; the paper's is not.
     """
 
     patch: int
@@ -119,6 +120,7 @@ class DiTConfig:
     width: int
     heads: int
     prediction: str = "epsilon"
+    inpainting: bool = False
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,14 @@ from models.labels import PART_DROPOUT, list_dropped_labels
 from models.layout import FEATURES, LayoutSpec
 from models.lvae import LayoutVAE
 from models.presets import DiTPreset, LVAEPreset
-from models.sampling.diffusion import finish_drawing, make_keyed_generator, start_drawing
+from models.sampling.diffusion import (
+    InpaintCondition,
+    finish_drawing,
+    join_known,
+    make_keyed_generator,
+    start_drawing,
+)
+from models.sampling.known_regions import NUM_UNIFORM, make_training_masks
 from models.vae.losses import compute_lvae_loss
 from models.vae.matching import NonFiniteCostError
 
@@ -371,7 +378,8 @@ def make_diffusion_loss(dit: DiT, label_dropout: float, config: DiffusionLossCon
         config: Options; None: those of the paper.
 
     Returns:
-        A function that computes the losses from a batch of posteriors (`mean`, `logvar`) and labels (`label`).
+        A function that computes the losses from a batch of posteriors (`mean`, `logvar`) and labels (`label`). An
+        inpainting model receives random known parts (`make_training_masks`), which have no error.
     """
     config = config or DiffusionLossConfig()
     diffusion = dit.diffusion
@@ -380,6 +388,7 @@ def make_diffusion_loss(dit: DiT, label_dropout: float, config: DiffusionLossCon
     scale = torch.tensor(dit.config.scale or [1.0] * shape[0], device=dit.device)[:, None, None]
     parts = list_dropped_labels(dit.config.label)
     remaining = None if parts is None else torch.tensor(parts, device=dit.device)
+    inpainting = dit.config.inpainting
 
     def loss(
         model: Callable[..., Any], arrays: dict[str, Tensor], generators: list[torch.Generator]
@@ -388,16 +397,21 @@ def make_diffusion_loss(dit: DiT, label_dropout: float, config: DiffusionLossCon
         device = mean.device
         # No line below waits for a GPU. Random numbers are thus drawn during the backward pass of the previous step.
         *posterior_noise, noise = sample_noise(generators, shape, device, count=1 + config.sample_posterior)
-        uniform = sample_uniform(generators, 2 if remaining is None else 4, device)
+        count = 2 if remaining is None else 4
+        uniform = sample_uniform(generators, count + NUM_UNIFORM * inpainting, device)
         drawn = mean + (0.5 * logvar).exp() * posterior_noise[0] if posterior_noise else mean
         latent = (drawn - shift) / scale
         timestep = sample_timesteps(uniform[:, 0], config.timestep_sampling, diffusion.num_timesteps)
         if remaining is not None:
-            dropped = (uniform[:, 2:] < PART_DROPOUT).long()
+            dropped = (uniform[:, 2:4] < PART_DROPOUT).long()
             label = remaining[label, dropped[:, 0] + 2 * dropped[:, 1]]
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
-        predicted = model(diffusion.add_noise(latent, noise, timestep), timestep, label)
-        error = F.mse_loss(predicted.float(), noise, reduction="none").flatten(1).mean(1)
+        noisy = diffusion.add_noise(latent, noise, timestep)
+        if inpainting:
+            mask = make_training_masks(uniform[:, count:], shape[0], shape[1])
+            noisy = join_known(noisy, InpaintCondition(latent, mask))
+        error = F.mse_loss(model(noisy, timestep, label).float(), noise, reduction="none")
+        error = (error * mask if inpainting else error).flatten(1).mean(1)
         weight = compute_loss_weight(dit, timestep, config.loss_weighting)
         return {"loss": (weight * error).mean(), "noise_error": error.mean()}
 

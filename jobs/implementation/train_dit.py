@@ -145,6 +145,8 @@ def resolve_preset(config: Config) -> DiTPreset:
         row = replace(row, batch_size=config.batch_size)
     if config.prediction_type is not None:
         row = replace(row, model=replace(row.model, prediction=config.prediction_type))
+    if config.inpainting is not None:
+        row = replace(row, model=replace(row.model, inpainting=config.inpainting))
     if config.normalise_latents is not None:
         row = replace(row, normalise_latents=config.normalise_latents)
     if config.sample_posterior is not None:
@@ -215,6 +217,8 @@ def make_run_identity(
         identity |= {"loss_weighting": loss.loss_weighting}
     if loss.sample_posterior != paper.sample_posterior:
         identity |= {"sample_posterior": loss.sample_posterior}
+    if row.model.inpainting:
+        identity |= {"inpainting": True}
     if config.round_weights:
         identity |= {"round_weights": True}
     return identity
@@ -259,6 +263,8 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
             f"{storage.join_uri(directory, 'lvae')}"
         )
     built = pipeline.dit.config
+    if built["inpainting"] and not architecture["inpainting"]:
+        raise ValueError(f"--start-from {model} is an inpainting model; add --inpainting")
     for key in ("patch", "depth", "width", "heads", "prediction", "label"):
         if built[key] != architecture[key]:
             raise ValueError(
@@ -285,7 +291,10 @@ def build(
     torch.manual_seed(settings.seed)
     model = DiT(**architecture)
     if start:
-        model.load_state_dict(start.state)
+        new = model.load_state_dict(start.state, strict=False)
+        # Weights for the known part, which older models lack, start at zero.
+        if new.unexpected_keys or set(new.missing_keys) - {"known_in.weight"}:
+            raise ValueError(f"the weights to start from do not fit: {new}")
     return make_dit_trainer(model, settings, label_dropout, device, wrap, execution, loss_config)
 
 

@@ -349,6 +349,44 @@ class InpaintCondition:
     mask: Float[Tensor, "b c h w"]
 
 
+def join_known(latent: Float[Tensor, "b c h w"], condition: InpaintCondition) -> Float[Tensor, "b 3*c h w"]:
+    """Append the known part to noisy latents, as the input of an inpainting network (`models.dit.DiT`).
+
+    Args:
+        latent: Noisy latents.
+        condition: Known part of the clean latents.
+
+    Returns:
+        Noisy latents; clean latents, 0 where they are unknown; and 1 where they are known, else 0.
+    """
+    known = 1 - condition.mask
+    return torch.cat([latent, known * condition.latent, known], dim=1)
+
+
+def with_known(model: Denoiser, condition: InpaintCondition, diffusion: Diffusion) -> Denoiser:
+    """Condition an inpainting network on known parts, with any sampler.
+
+    In the known part, the predicted noise is the one whose clean estimate is the known latent. Sampling therefore ends
+    at the known latent.
+
+    Args:
+        model: Inpainting network.
+        condition: Known part of the latents.
+        diffusion: Noise schedule.
+
+    Returns:
+        A denoiser for latents without the known part.
+    """
+    kept = ~condition.mask.bool()
+
+    def predict(latent: Tensor, timestep: Tensor, label: Tensor) -> Tensor:
+        noise = model(join_known(latent, condition), timestep, label)
+        alpha_bar = float(diffusion.alpha_bar[int(timestep[0])])
+        return torch.where(kept, (latent - alpha_bar**0.5 * condition.latent) / (1 - alpha_bar) ** 0.5, noise)
+
+    return predict
+
+
 @torch.no_grad()
 def sample(
     model: Denoiser,

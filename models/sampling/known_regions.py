@@ -1,0 +1,49 @@
+"""Random known regions for the training of an inpainting model (`models.dit.DiT` with `inpainting`)."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+NUM_UNIFORM = 10  # Random numbers per sample that `make_training_masks` needs.
+NOTHING, STRIPS = 0.35, 0.45  # Shares of samples without a known region, and with known strips; the others have a hole.
+SIDE = 0.6  # Probability that a strip along one side is known.
+ONE_CONTENT = 0.1  # Shares of samples that also know all of the ground, and all objects.
+
+
+def make_training_masks(
+    uniform: Float[Tensor, "b 10"], channels: int, size: int
+) -> Float[Tensor, "b channels size size"]:
+    """Make masks of latents from random numbers.
+
+    The masks are those of outpainting and inpainting: nothing is known; strips of up to half a block along one or more
+    sides are known, as on a grid of blocks; or everything outside of a rectangle is known. In addition, some samples
+    know all of the ground, or all objects. As in `models.composition.inpaint.make_latent_mask`, the first half of the
+    channels belongs to the ground.
+
+    Args:
+        uniform: Random numbers between 0 and 1, NUM_UNIFORM per sample.
+        channels: Number of channels of a latent.
+        size: Number of cells per side of a latent.
+
+    Returns:
+        Masks; 1 marks values to generate, 0 marks known values.
+    """
+    kind, sides, corners, content = uniform.split([1, 4, 4, 1], dim=1)
+    cell = torch.arange(size, device=uniform.device)
+    # A number below SIDE determines the width of the strip, from 1 cell to half of the cells.
+    width = torch.where(sides < SIDE, (sides / SIDE * (size // 2)).long() + 1, 0)
+    first, last = cell < width[:, [0, 2], None], cell >= size - width[:, [1, 3], None]
+    rows, cols = (first | last).unbind(1)
+    strips = rows[:, :, None] | cols[:, None, :]
+    low, high = (corners * (size + 1)).long().view(-1, 2, 2).sort(dim=2).values.unbind(2)
+    inside_rows, inside_cols = ((cell >= low[:, :, None]) & (cell < high[:, :, None])).unbind(1)
+    outside = ~(inside_rows[:, :, None] & inside_cols[:, None, :])
+    kind = kind[:, :, None]
+    known = torch.where(kind < NOTHING, False, torch.where(kind < NOTHING + STRIPS, strips, outside))
+    whole_ground, whole_objects = content < ONE_CONTENT, content > 1 - ONE_CONTENT
+    ground, objects = known | whole_ground[:, :, None], known | whole_objects[:, :, None]
+    half = channels // 2
+    parts = [ground[:, None].expand(-1, half, -1, -1), objects[:, None].expand(-1, channels - half, -1, -1)]
+    return 1 - torch.cat(parts, dim=1).float()
