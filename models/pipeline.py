@@ -50,8 +50,9 @@ from models.sampling.diffusion import (
     scale_noise,
     switch_at_timestep,
     with_guidance,
+    with_known,
 )
-from models.sampling.repaint import NUM_INFERENCE_STEPS, RePaintConfig
+from models.sampling.repaint import NUM_INFERENCE_STEPS, InpaintingConfig, RePaintConfig, TrainedInpainting
 from models.sampling.schedulers import SAMPLERS, SchedulerConfig
 from models.scene import Scene
 from models.tensors import EXISTENCE_THRESHOLD, make_empty_scene, make_layout_batch
@@ -655,6 +656,25 @@ class PrITTIPipeline:
             raise ValueError(f"existence_threshold is {existence_threshold}, expected between 0 and 1")
         return existence_threshold
 
+    def resolve_inpainting(self, repaint: InpaintingConfig | None) -> InpaintingConfig:
+        """Return options of inpainting and outpainting, or the default of the model if the argument is None.
+
+        Args:
+            repaint: Options; None: the default.
+
+        Returns:
+            The options. By default, an inpainting network uses the sampler of the pipeline; the others use RePaint with
+            the options of the paper.
+
+        Raises:
+            ValueError: The network cannot read a known part.
+        """
+        if isinstance(repaint, TrainedInpainting) and not self.dit.config.inpainting:
+            raise ValueError("this model is no inpainting model; use RePaintConfig, or train it with --inpainting")
+        if repaint is not None:
+            return repaint
+        return TrainedInpainting() if self.dit.config.inpainting else RePaintConfig()
+
     @contextmanager
     def _step_callback(self, num_evaluations: int, callback: StepCallback | None) -> Iterator[OnStep]:
         """Yield a function for the sampler to call after each step.
@@ -679,8 +699,9 @@ class PrITTIPipeline:
         callback_on_step_end: StepCallback | None = None,
         noise_scaling: float | None = None,
         purpose: int = GENERATE,
+        condition: InpaintCondition | None = None,
     ) -> Float[Tensor, "b c h w"]:
-        """Sample latents. Each latent depends only on the seed, its index and its label.
+        """Sample latents. Each latent depends only on the seed, its index, its label and its condition.
 
         Args:
             labels: Label of each scene.
@@ -691,34 +712,45 @@ class PrITTIPipeline:
             callback_on_step_end: See `generate`.
             noise_scaling: Divisor of the predicted noise; None: the default of the pipeline.
             purpose: Purpose of the noise: GENERATE, OUTPAINT or INPAINT (models/sampling/diffusion.py).
+            condition: Known part of the latents, which an inpainting network continues.
 
         Returns:
             Latents.
 
         Raises:
-            ValueError: A label is unknown, a number is out of range, or the scheduler uses fractional timesteps.
+            ValueError: A label is unknown, a number is out of range, the scheduler uses fractional timesteps, or the
+                network cannot read a known part.
         """
         noise = SceneNoise(seed, indices, self.latent_shape, self.device, purpose)
         label, noise_scaling = self.label_tensor(labels), self.resolve_noise_scaling(noise_scaling)
         steps: int = self.config.num_inference_steps if num_inference_steps is None else num_inference_steps
-        with self._step_callback(steps, callback_on_step_end) as on_step:
+        timesteps = self._select_timesteps(steps)
+        model = scale_noise(self.make_denoiser(timesteps, label, guidance_scale), noise_scaling)
+        if condition is not None:
+            model = with_known(model, condition, self.diffusion)
+        with (
+            self._step_callback(steps, callback_on_step_end) as on_step,
+            self._guide(model, timesteps, condition) as guided,
+        ):
             if self.uses_ddpm:
-                schedule = SamplingSchedule(self.diffusion, steps)
-                model = scale_noise(self.make_denoiser(schedule.timesteps, label, guidance_scale), noise_scaling)
-                with self._guide(model, schedule.timesteps) as guided:
-                    return sample(guided, schedule, noise, label, on_step=on_step)
-            # Raise an error for an invalid number of steps; diffusers would accept it.
-            self.diffusion.select_timesteps(steps)
-            self.scheduler.set_timesteps(steps, device=self.device)
-            timesteps = self.scheduler.timesteps
-            if timesteps.is_floating_point():
-                raise ValueError(
-                    f"{self.scheduler_config.class_name} uses fractional timesteps, which the DiT does not support; "
-                    "use DPM-Solver++ or DDIM"
-                )
-            model = scale_noise(self.make_denoiser(timesteps, label, guidance_scale), noise_scaling)
-            with self._guide(model, timesteps) as guided:
-                return sample_with_scheduler(guided, self.scheduler, noise, label, on_step)
+                latents = sample(guided, SamplingSchedule(self.diffusion, steps), noise, label, on_step=on_step)
+            else:
+                latents = sample_with_scheduler(guided, self.scheduler, noise, label, on_step)
+        return latents if condition is None else torch.where(condition.mask.bool(), latents, condition.latent)
+
+    def _select_timesteps(self, num_inference_steps: int) -> np.ndarray | Tensor:
+        """Return the timesteps of the sampler, and prepare the scheduler of diffusers for them."""
+        # Raise an error for an invalid number of steps; diffusers would accept it.
+        timesteps = self.diffusion.select_timesteps(num_inference_steps)
+        if self.uses_ddpm:
+            return timesteps
+        self.scheduler.set_timesteps(num_inference_steps, device=self.device)
+        if self.scheduler.timesteps.is_floating_point():
+            raise ValueError(
+                f"{self.scheduler_config.class_name} uses fractional timesteps, which the DiT does not support; "
+                "use DPM-Solver++ or DDIM"
+            )
+        return self.scheduler.timesteps
 
     def generate(
         self,
@@ -774,12 +806,12 @@ class PrITTIPipeline:
         labels: Sequence[str],
         seed: int | Sequence[int],
         indices: Sequence[SceneKey],
-        repaint: RePaintConfig,
+        repaint: InpaintingConfig | None = None,
         guidance_scale: float = 1.0,
         callback_on_step_end: StepCallback | None = None,
         purpose: int = GENERATE,
     ) -> Float[Tensor, "b c h w"]:
-        """Sample latents with RePaint (paper, Sec. 3.3).
+        """Sample latents with RePaint (paper, Sec. 3.3), or with an inpainting network.
 
         Where the mask of the condition is 0, the latents are bit-identical to the condition.
 
@@ -788,7 +820,7 @@ class PrITTIPipeline:
             labels: Label of each scene.
             seed: One seed for all scenes, or one per scene.
             indices: Key of each scene; the noise depends on the seed and this key.
-            repaint: Options of RePaint.
+            repaint: Options of inpainting; None: see `resolve_inpainting`.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `generate`.
             purpose: Purpose of the noise: GENERATE, OUTPAINT or INPAINT (models/sampling/diffusion.py).
@@ -797,8 +829,14 @@ class PrITTIPipeline:
             Latents.
 
         Raises:
-            ValueError: A label is unknown or a number is out of range.
+            ValueError: A label is unknown, a number is out of range, or the network cannot read a known part.
         """
+        repaint = self.resolve_inpainting(repaint)
+        if isinstance(repaint, TrainedInpainting):
+            steps = repaint.num_inference_steps
+            return self.sample_latents(
+                labels, seed, indices, steps, guidance_scale, callback_on_step_end, None, purpose, condition
+            )
         schedule = SamplingSchedule(self.diffusion, repaint.num_inference_steps, repaint.eta)
         noise = SceneNoise(seed, indices, self.latent_shape, self.device, purpose)
         label = self.label_tensor(labels)
@@ -828,7 +866,7 @@ class PrITTIPipeline:
         contents: Contents = "both",
         seed: int = 0,
         indices: Sequence[SceneKey] | None = None,
-        repaint: RePaintConfig | None = None,
+        repaint: InpaintingConfig | None = None,
         guidance_scale: float = 1.0,
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
         callback_on_step_end: StepCallback | None = None,
@@ -846,7 +884,7 @@ class PrITTIPipeline:
                 and height, so "ground" knows only the places and shapes of the objects.
             seed: Seed of the run.
             indices: Key of each scene; the noise depends on it (default: 0, 1, ...).
-            repaint: Options of RePaint; None: the options of the paper.
+            repaint: Options of inpainting; None: see `resolve_inpainting`.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             generator: See `generate`.
             callback_on_step_end: See `generate`.
@@ -873,7 +911,7 @@ class PrITTIPipeline:
             labels,
             seeds,
             indices,
-            repaint or RePaintConfig(),
+            repaint,
             guidance_scale,
             callback_on_step_end,
             INPAINT,
@@ -895,7 +933,7 @@ class PrITTIPipeline:
         overlap: float = 0.5,
         mode: str | None = None,
         num_blocks: tuple[int, int, int, int] = (1, 1, 1, 1),
-        repaint: RePaintConfig | None = None,
+        repaint: InpaintingConfig | None = None,
         guidance_scale: float = 1.0,
         callback_on_step_end: StepCallback | None = None,
         side: Side | None = None,
@@ -915,7 +953,7 @@ class PrITTIPipeline:
                 ground and without removal of duplicates. None: the mode that the pipeline stores (`neighbour_latents`).
             num_blocks: Number of blocks to add ahead, behind, to the left and to the right. The paper adds one block on
                 every side.
-            repaint: Options of RePaint; None: the options of the paper.
+            repaint: Options of inpainting; None: see `resolve_inpainting`.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `generate`.
             side: "ahead", "behind", "left" or "right". If `side` is set, the scene is extended only on this side, by

@@ -13,7 +13,7 @@ from models.composition.inpaint import Contents, composite_scenes, grow_to_cells
 from models.composition.outpaint import BlockGrid, find_ground_height
 from models.composition.seam_blending import extract_new_part, extrapolate_ground
 from models.sampling.diffusion import OUTPAINT, InpaintCondition
-from models.sampling.repaint import RePaintConfig
+from models.sampling.repaint import InpaintingConfig
 from models.scene import Grid, Scene, merge_scenes
 from models.tensors import make_empty_scene
 
@@ -190,7 +190,7 @@ def inpaint_blocks(
     contents: Contents = "both",
     seed: int = 0,
     indices: Sequence[int] = (0,),
-    repaint: RePaintConfig | None = None,
+    repaint: InpaintingConfig | None = None,
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
 ) -> Iterator[InpaintStep]:
@@ -207,7 +207,7 @@ def inpaint_blocks(
         contents: Part of the scene to regenerate; see `PrITTIPipeline.inpaint`.
         seed: Seed of the noise.
         indices: Index of each variant; the noise depends on the seed and this index.
-        repaint: Options of RePaint; None: the options of the paper.
+        repaint: Options of inpainting; None: see `resolve_inpainting`.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
 
@@ -251,7 +251,7 @@ def extend_scene(
     label: str,
     seed: int = 0,
     overlap: float = 0.5,
-    repaint: RePaintConfig | None = None,
+    repaint: InpaintingConfig | None = None,
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
 ) -> Scene:
@@ -267,7 +267,7 @@ def extend_scene(
         label: Label of all blocks.
         seed: Seed of the noise.
         overlap: Fraction of a block that overlaps the scene; it must correspond to a whole number of latent cells.
-        repaint: Options of RePaint; None: the options of the paper.
+        repaint: Options of inpainting; None: see `resolve_inpainting`.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
 
@@ -298,7 +298,7 @@ def extend_scene(
             [label],
             seed,
             [(number, step_px, grid.rows, grid.cols, get_args(Side).index(side))],
-            repaint or RePaintConfig(),
+            repaint,
             guidance_scale,
             callback_on_step_end,
             OUTPAINT,

@@ -11,7 +11,7 @@ from torch import Tensor
 from models.composition.inpaint import Contents
 from models.layout import LayoutSpec
 from models.sampling.diffusion import InpaintCondition, SceneKey
-from models.sampling.repaint import RePaintConfig
+from models.sampling.repaint import InpaintingConfig
 from models.scene import Scene
 
 # Type of diffusers' `callback_on_step_end`: (pipeline, step, timestep, tensors) -> tensors.
@@ -117,13 +117,24 @@ class SceneGenerator(Protocol):
         """
         ...
 
+    def resolve_inpainting(self, repaint: InpaintingConfig | None) -> InpaintingConfig:
+        """Return options of inpainting and outpainting.
+
+        Args:
+            repaint: Options; None: the default of the model (`PrITTIPipeline.resolve_inpainting`).
+
+        Returns:
+            The options.
+        """
+        ...
+
     def inpaint_latents(
         self,
         condition: InpaintCondition,
         labels: Sequence[str],
         seed: int | Sequence[int],
         indices: Sequence[SceneKey],
-        repaint: RePaintConfig,
+        repaint: InpaintingConfig | None = None,
         guidance_scale: float = 1.0,
         callback_on_step_end: StepCallback | None = None,
         purpose: int = ...,
@@ -135,7 +146,7 @@ class SceneGenerator(Protocol):
             labels: Label of each scene.
             seed: Seed of the noise, or one seed per scene.
             indices: Key of each scene; the noise depends on the seed and this key.
-            repaint: Options of RePaint.
+            repaint: Options of inpainting; None: see `resolve_inpainting`.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `PrITTIPipeline.generate`.
             purpose: Purpose of the noise: GENERATE, OUTPAINT or INPAINT (models/sampling/diffusion.py).
@@ -153,7 +164,7 @@ class SceneGenerator(Protocol):
         contents: Contents = "both",
         seed: int = 0,
         indices: Sequence[SceneKey] | None = None,
-        repaint: RePaintConfig | None = None,
+        repaint: InpaintingConfig | None = None,
         guidance_scale: float = 1.0,
         *,
         callback_on_step_end: StepCallback | None = None,
@@ -168,7 +179,7 @@ class SceneGenerator(Protocol):
             contents: Part of the scene to regenerate: "both", "ground" or "objects".
             seed: Seed of the noise.
             indices: Key of each scene; the noise depends on the seed and this key.
-            repaint: Options of RePaint; None: the options of the paper.
+            repaint: Options of inpainting; None: see `resolve_inpainting`.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `PrITTIPipeline.generate`.
             composite: If True, copy everything outside the regions from the input.

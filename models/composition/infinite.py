@@ -16,7 +16,7 @@ from models.composition.outpaint import (
     generate_blocks,
     rank_four_colors,
 )
-from models.sampling.repaint import RePaintConfig
+from models.sampling.repaint import InpaintingConfig
 from models.scene import Grid, Scene
 
 
@@ -32,7 +32,7 @@ class InfiniteScene:
         seed: Seed of the scene.
         overlap: Fraction of a block that overlaps its neighbour; it must be below 0.5.
         mode: "reencode", "copy" or "paper"; see `PrITTIPipeline.outpaint`.
-        repaint: Options of RePaint; None: the options of the paper.
+        repaint: Options of inpainting; None: see `resolve_inpainting`.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
 
     Raises:
@@ -46,7 +46,7 @@ class InfiniteScene:
         seed: int = 0,
         overlap: float = 0.25,
         mode: str = "reencode",
-        repaint: RePaintConfig | None = None,
+        repaint: InpaintingConfig | None = None,
         guidance_scale: float = 1.0,
     ) -> None:
         self.model, self.label, self.seed = model, label, seed

@@ -26,7 +26,7 @@ from models.composition.seam_blending import extract_new_part, extrapolate_groun
 from models.labels import mark_free, require_labels
 from models.layout import LayoutSpec
 from models.sampling.diffusion import OUTPAINT, InpaintCondition
-from models.sampling.repaint import RePaintConfig
+from models.sampling.repaint import InpaintingConfig, RePaintConfig
 from models.scene import Grid, Scene, concatenate_primitives, merge_scenes
 from models.tensors import make_empty_scene
 
@@ -556,7 +556,7 @@ def generate_blocks(
     seed: int = 0,
     scene_index: int = 0,
     mode: str = "reencode",
-    repaint: RePaintConfig | None = None,
+    repaint: InpaintingConfig | None = None,
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
 ) -> dict[BlockIndex, SceneBlock]:
@@ -572,9 +572,9 @@ def generate_blocks(
         seed: Seed of the noise.
         scene_index: Index of the scene. The noise depends on the seed, this index and the block index.
         mode: One of MODES.
-        repaint: Options of RePaint; None: the options of the paper. They apply to blocks with known surroundings. The
-            others are generated like single scenes, with the sampler of the model; if it is DDPM, with the steps of
-            `repaint`.
+        repaint: Options of inpainting; None: see `resolve_inpainting`. Blocks without known surroundings are generated
+            like single scenes, with the sampler of the model; if it is DDPM and RePaint is used, with the steps of
+            RePaint.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
 
@@ -593,22 +593,22 @@ def generate_blocks(
     labels = [label if isinstance(label, str) else label[index] for index in indices]
     keys = [(scene_index, *index) for index in indices]
     alone = [not as_paper and (c.is_empty or c.known_ground < HARDLY_KNOWN) for c in conditions]
-    latents = torch.stack([condition.latent for condition in conditions])
-    repaint = repaint or RePaintConfig()
+    latents, masks = (torch.stack(values) for values in zip(*((c.latent, c.mask) for c in conditions), strict=True))
+    repaint = model.resolve_inpainting(repaint)
+    masks[alone] = 1.0
     for new in (True, False):
         chosen = [k for k, one in enumerate(alone) if one == new]
         if not chosen:
             continue
-        names, chosen_keys = [labels[k] for k in chosen], [keys[k] for k in chosen]
-        if new and not model.uses_ddpm:  # With DDPM, fewer steps than the model's would lose objects.
-            latents[chosen] = model.sample_latents(
-                names, seed, chosen_keys, None, guidance_scale, callback_on_step_end, purpose=OUTPAINT
-            )
-            continue
-        mask, options = torch.stack([conditions[k].mask for k in chosen]), repaint
-        if new:  # Without a known region, resampling has no effect.
-            mask, options = torch.ones_like(mask), replace(repaint, resamplings=1, pseudoinverse_guidance=0.0)
-        condition = InpaintCondition(latents[chosen], mask)
+        names, chosen_keys, options = [labels[k] for k in chosen], [keys[k] for k in chosen], repaint
+        if new and isinstance(repaint, RePaintConfig):
+            if not model.uses_ddpm:  # With DDPM, fewer steps than the model's would lose objects.
+                latents[chosen] = model.sample_latents(
+                    names, seed, chosen_keys, None, guidance_scale, callback_on_step_end, purpose=OUTPAINT
+                )
+                continue
+            options = replace(repaint, resamplings=1, pseudoinverse_guidance=0.0)  # Without effect on such blocks.
+        condition = InpaintCondition(latents[chosen], masks[chosen])
         latents[chosen] = model.inpaint_latents(
             condition, names, seed, chosen_keys, options, guidance_scale, callback_on_step_end, OUTPAINT
         )
@@ -629,7 +629,7 @@ def outpaint_scene(
     overlap: float,
     mode: str,
     num_blocks: tuple[int, int, int, int],
-    repaint: RePaintConfig | None,
+    repaint: InpaintingConfig | None,
     guidance_scale: float,
     callback_on_step_end: StepCallback | None,
 ) -> Scene:
@@ -644,7 +644,7 @@ def outpaint_scene(
         overlap: Fraction of a block that overlaps its neighbour; it must correspond to a whole number of latent cells.
         mode: One of MODES.
         num_blocks: Number of blocks to add ahead, behind, to the left and to the right.
-        repaint: Options of RePaint; None: the options of the paper.
+        repaint: Options of inpainting; None: see `resolve_inpainting`.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
 

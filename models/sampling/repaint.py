@@ -1,4 +1,8 @@
-"""Options of RePaint (Lugmayr et al., 2022) and the order of its steps (paper, supplement B.3, Applications)."""
+"""Options of inpainting and outpainting.
+
+RePaint (Lugmayr et al., 2022; paper, supplement B.3, Applications) works with every network. Networks that were trained
+to continue known parts need no RePaint.
+"""
 
 from __future__ import annotations
 
@@ -44,8 +48,21 @@ def repaint_transitions(
 
 
 @dataclass(frozen=True)
+class TrainedInpainting:
+    """Options of inpainting and outpainting with a network that reads the known part (`models.dit.DiT`).
+
+    The sampler is that of the pipeline.
+
+    Attributes:
+        num_inference_steps: Number of denoising steps; None: the default of the pipeline.
+    """
+
+    num_inference_steps: int | None = None
+
+
+@dataclass(frozen=True)
 class RePaintConfig:
-    """Options of inpainting and outpainting. The defaults are those of the paper.
+    """Options of inpainting and outpainting with any network. The defaults are those of the paper.
 
     Attributes:
         num_inference_steps: Number of timesteps that sampling uses.
@@ -96,3 +113,6 @@ class RePaintConfig:
     def num_evaluations(self) -> int:
         """Number of denoising steps."""
         return sum(to < state for state, to in self.transitions())
+
+
+InpaintingConfig = RePaintConfig | TrainedInpainting
