@@ -61,8 +61,8 @@ STAGES = {
     " --checkpoint-every 8",
     "sample": "sample_scenes --model @train_dit --num-scenes 136 --num-inference-steps 2 --existence-threshold 0.01"
     " --num-actors 2 --output @",
-    "outpaint": "outpaint_scenes --model @train_dit --input @sample --max-scenes 1 --guided --num-inference-steps 2"
-    " --num-actors 2 --output @",
+    "outpaint": "outpaint_scenes --model @train_dit --input @sample --max-scenes 1 --inpainting guided"
+    " --num-inference-steps 2 --num-actors 2 --output @",
     "edit": "edit_scenes translate --input @sample --where true --offset-m 1 0 0 --num-examples 1 --output @",
     "evaluate": "evaluate_scenes --real @preprocess --generated @sample --run samples --lvae @train_lvae --lite0 False"
     " --max-scenes 24 --max-reconstructed-scenes 8 --num-examples 1 --output @",

@@ -175,7 +175,7 @@ def measure_rates(stages: Stages, raw: Path) -> dict[str, dict[str, float]]:
         found.setdefault("sample", {})[size] = stages.measure(test, f"made-{size}", "sample_scenes", *words)
         words = ("--real", town, "--generated", where(f"made-{size}"), "--max-scenes", str(test), "--controls")
         found.setdefault("evaluate", {})[size] = stages.measure(test, f"scores-{size}", "evaluate_scenes", *words)
-        words = ("--model", "town", "--input", where("made-few"), "--max-scenes", "1", "--guided")
+        words = ("--model", "town", "--input", where("made-few"), "--max-scenes", "1", "--inpainting", "guided")
         sides = ("ahead", "behind", "left", "right")
         words += tuple(word for side in sides for word in (f"--blocks-{side}", "1" if size == "few" else "2"))
         found.setdefault("outpaint", {})[size] = stages.measure(BLOCKS[size], f"city-{size}", "outpaint_scenes", *words)

@@ -663,17 +663,19 @@ class PrITTIPipeline:
             repaint: Options; None: the default.
 
         Returns:
-            The options. By default, an inpainting network uses the sampler of the pipeline; the others use RePaint with
-            the options of the paper.
+            The options with a number of steps. By default, an inpainting network uses the sampler of the pipeline; the
+            others use RePaint with the options of the paper.
 
         Raises:
             ValueError: The network cannot read a known part.
         """
-        if isinstance(repaint, TrainedInpainting) and not self.dit.config.inpainting:
-            raise ValueError("this model is no inpainting model; use RePaintConfig, or train it with --inpainting")
-        if repaint is not None:
+        if repaint is None:
+            repaint = TrainedInpainting() if self.dit.config.inpainting else RePaintConfig()
+        if isinstance(repaint, RePaintConfig):
             return repaint
-        return TrainedInpainting() if self.dit.config.inpainting else RePaintConfig()
+        if not self.dit.config.inpainting:
+            raise ValueError("this model is no inpainting model; use RePaintConfig, or train it with --inpainting")
+        return TrainedInpainting(repaint.num_inference_steps or self.config.num_inference_steps)
 
     @contextmanager
     def _step_callback(self, num_evaluations: int, callback: StepCallback | None) -> Iterator[OnStep]:

@@ -7,7 +7,7 @@ from jobs.inpaint_scenes import Config
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
-from jobs.support.scene_requests import make_execution, make_repaint_config, select_scenes
+from jobs.support.scene_requests import make_execution, make_inpainting_config, select_scenes
 from pipelines.generation.inpaint import InpaintRequest, RegionConfig, inpaint_scenes
 
 
@@ -16,8 +16,9 @@ def inpaint(config: Config) -> dict[str, float | None]:
     check_inpaint_scenes(config)
     selection = select_scenes(config)
     total = sum(len(rows) for _, rows in selection.shards())
+    model = find_pipeline_directory(config.model)
     request = InpaintRequest(
-        model=find_pipeline_directory(config.model),
+        model=model,
         output=config.output_directory(),
         run=config.run,
         where=RegionConfig(
@@ -27,7 +28,7 @@ def inpaint(config: Config) -> dict[str, float | None]:
         variants=config.num_variants,
         label=config.label or None,
         seed=config.seed,
-        repaint=make_repaint_config(config),
+        repaint=make_inpainting_config(config, model),
         execution=make_execution(config),
         guidance_scale=config.guidance_scale,
         constraints=config.constraints,

@@ -12,7 +12,7 @@ from jobs.support.cli import make_absolute
 from jobs.support.model_directories import find_pipeline_directory, read_label_kind
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
-from jobs.support.scene_requests import make_execution, make_repaint_config, select_scenes
+from jobs.support.scene_requests import make_execution, make_inpainting_config, select_scenes
 from models.composition.outpaint import HARDLY_KNOWN, label_blocks
 from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
 from pipelines.runtime import storage
@@ -91,7 +91,7 @@ def outpaint(config: Config) -> list[str]:
         seed=config.seed,
         overlap=config.overlap,
         mode=config.neighbour_latents,
-        repaint=make_repaint_config(config),
+        repaint=make_inpainting_config(config, model),
         execution=make_execution(config),
         guidance_scale=config.guidance_scale,
         constraints=config.constraints,

@@ -113,7 +113,7 @@ def run_generation_stages(config: Config, stages: Stages) -> dict:
         max_scenes=1,
         seed=config.seed,
         num_inference_steps=config.outpaint_inference_steps,
-        guided=True,
+        inpainting="guided",
     )
     stages.run("outpaint a scene", lambda: outpaint(outpainting))
     evaluation = EvaluateConfig(

@@ -7,14 +7,14 @@ from itertools import product
 import pyarrow as pa
 
 from jobs.support.cli import require_positive, resolve_path
-from jobs.support.model_directories import find_pipeline_directory
+from jobs.support.model_directories import find_pipeline_directory, is_inpainting_model
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import select_scenes
 from jobs.support.terminal import print_table
 from jobs.sweep_seams import Config
 from models.sampling.diffusion import Diffusion
-from models.sampling.repaint import RePaintConfig
+from models.sampling.repaint import InpaintingConfig, RePaintConfig, TrainedInpainting
 from pipelines.evaluation.seam_sweep import (
     build_seam_table,
     count_objects_per_ha,
@@ -34,12 +34,18 @@ def sweep_seams(config: Config) -> list[dict]:
     """Outpaint and measure every setting, write all files, and return a row per setting."""
     require_positive(config, "num_actors", "batch_size")
     model = find_pipeline_directory(config.model)
-    if not (config.settings and config.neighbour_latents):
+    if not (config.settings or config.trained_steps) or not config.neighbour_latents:
         raise ValueError("--settings or --neighbour-latents is empty: expected five numbers per setting, and a way")
+    if config.trained_steps and not is_inpainting_model(model):
+        raise ValueError(f"--trained-steps: {model} is no inpainting model")
 
     for setting in config.settings:
         RePaintConfig(*setting).transitions()  # raise an error for an invalid setting before hours of outpainting
         Diffusion().select_timesteps(setting[0])
+    settings: dict[str, InpaintingConfig] = {
+        "-".join(f"{value:g}" for value in setting): RePaintConfig(*setting) for setting in config.settings
+    }
+    settings |= {f"trained-{steps}": TrainedInpainting(steps) for steps in config.trained_steps}
     output = resolve_path(config.output, "evaluations", "sweep-seams")
     selection = select_scenes(config)
     count = sum(len(rows) for _, rows in selection.shards())
@@ -48,8 +54,8 @@ def sweep_seams(config: Config) -> list[dict]:
     rows, pictures = [], []
     with hold_output(output, "evaluation", config):
         with JobProgress() as bar:
-            for mode, setting in product(config.neighbour_latents, config.settings):
-                name = "-".join(f"{value:g}" for value in setting) + ("" if mode == "reencode" else f"-{mode}")
+            for mode, (name, repaint) in product(config.neighbour_latents, settings.items()):
+                name += "" if mode == "reencode" else f"-{mode}"
                 request = OutpaintRequest(
                     model=model,
                     output=output,
@@ -58,7 +64,7 @@ def sweep_seams(config: Config) -> list[dict]:
                     seed=config.seed,
                     overlap=config.overlap,
                     mode=mode,
-                    repaint=RePaintConfig(*setting),
+                    repaint=repaint,
                     guidance_scale=config.guidance_scale,
                     constraints=config.constraints,
                     batch_size=config.batch_size,
@@ -70,9 +76,7 @@ def sweep_seams(config: Config) -> list[dict]:
                 measured = measure_seams(SceneSubset(output, request.source), SeamLines(), config.num_actors)
                 objects = count_objects_per_ha(read_scenes(output, request.source))
                 seams = int(measured.seams.sum())
-                rows.append(
-                    make_seam_row(mode, request.repaint, seams, objects, estimate_seam_ratios(measured.records))
-                )
+                rows.append(make_seam_row(mode, repaint, seams, objects, estimate_seam_ratios(measured.records)))
                 first = next(read_scenes(output, request.source))
                 pictures.append(Picture(first.scene_id, draw_lines(first, SeamLines()), name))
             objects = count_objects_per_ha(scene for shard, chosen in real.shards() for scene in shard.scenes(chosen))

@@ -36,6 +36,11 @@ def read_label_kind(model: str) -> str:
     return storage.read_json(path)["label"]
 
 
+def is_inpainting_model(model: str) -> bool:
+    """Return whether the transformer of the pipeline in a directory reads known parts of a scene."""
+    return storage.read_json(storage.join_uri(model, "dit/config.json")).get("inpainting", False) is True
+
+
 def find_pipeline_directory(model: str) -> str:
     """Return the directory of the pipeline that --model names; a pipeline in MLflow is downloaded first.
 

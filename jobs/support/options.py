@@ -96,24 +96,24 @@ class GenerationOptions(SceneOptions):
 
 @dataclass(frozen=True)
 class RePaintOptions(GenerationOptions):
-    """Options for the scenes to change, the pipeline and RePaint (paper, Sec. 3.3 and supplement B.3).
+    """Options for the scenes to change, the pipeline and how it continues the known part of a scene."""
 
-    With --guided, seams are less visible and more objects are kept. With --guided, the job is also 24 times as fast as
-    with the paper's settings.
-    """
-
-    guided: bool = False
-    """Use 50 steps with pseudoinverse guidance, eta 0.3 and no resampling; the next options override these values."""
+    inpainting: Literal["trained", "guided", "repaint"] | None = None
+    """How the model continues known parts. trained: the network reads them, with the sampler that the model stores.
+    repaint: RePaint with the options of the paper (Sec. 3.3 and supplement B.3). guided: 50 steps with pseudoinverse
+    guidance, eta 0.3 and no resampling (default: trained for models of train_dit.py --inpainting, such as the released
+    weights, else repaint)."""
     num_inference_steps: int | None = None
-    """Number of denoising steps without RePaint's repetitions (default: 250 as in the paper; 50 with --guided)."""
+    """Number of denoising steps, without the repetitions of RePaint (default: as the model stores with trained, 250 as
+    in the paper with repaint, 50 with guided)."""
     jump_length: int | None = None
     """Jump length of RePaint in steps, J in the paper (default: 10)."""
     num_resamplings: int | None = None
-    """Number of times that RePaint passes each step, R in the paper (default: 10; 1 with --guided)."""
+    """Number of times that RePaint passes each step, R in the paper (default: 10 with repaint, 1 with guided)."""
     pseudoinverse_guidance: float | None = None
-    """Weight of pseudoinverse guidance towards the known region (default: 0; 1 with --guided)."""
+    """Weight of pseudoinverse guidance towards the known region (default: 0 with repaint, 1 with guided)."""
     eta: float | None = None
-    """Share of DDPM's noise that a step adds, 0 to 1 (default: 1 as in the paper; 0.3 with --guided)."""
+    """Share of DDPM's noise that a step adds, 0 to 1 (default: 1 with repaint, as in the paper; 0.3 with guided)."""
     precision: Literal["fp32", "bf16"] = "fp32"
     """Precision of the transformer. bf16 is faster on GPUs and changes scenes by rounding."""
     cuda_graphs: bool = False

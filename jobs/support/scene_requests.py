@@ -1,13 +1,14 @@
-"""Convert shared options to arguments of pipelines/: the scenes to read and the RePaint settings."""
+"""Convert shared options to arguments of pipelines/: the scenes to read, and how known parts are continued."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from jobs.support.cli import resolve_path
+from jobs.support.model_directories import is_inpainting_model
 from jobs.support.options import RePaintOptions, SceneOptions
 from models.execution import SamplingExecution
-from models.sampling.repaint import RePaintConfig
+from models.sampling.repaint import InpaintingConfig, RePaintConfig, TrainedInpainting
 from pipelines.schema.scene_subset import SceneSubset
 
 
@@ -22,14 +23,31 @@ def make_execution(options: RePaintOptions) -> SamplingExecution:
     return SamplingExecution(options.precision, options.cuda_graphs, options.compile)
 
 
-def make_repaint_config(options: RePaintOptions) -> RePaintConfig:
-    """Return the RePaint settings of the paper or of --guided, after changing the values that other options set."""
-    given = {
-        "num_inference_steps": options.num_inference_steps,
+def make_inpainting_config(options: RePaintOptions, model: str) -> InpaintingConfig:
+    """Return how the pipeline in a directory continues known parts.
+
+    Raises:
+        ValueError: The model is no inpainting model, or an option has no effect.
+    """
+    able = is_inpainting_model(model)
+    if options.inpainting == "trained" and not able:
+        raise ValueError(
+            f"--inpainting trained: {model} is no inpainting model; use guided or repaint, or train it with "
+            "jobs/train_dit.py --inpainting"
+        )
+    way = options.inpainting or ("trained" if able else "repaint")
+    of_repaint = {
         "jump_length": options.jump_length,
         "resamplings": options.num_resamplings,
         "pseudoinverse_guidance": options.pseudoinverse_guidance,
         "eta": options.eta,
     }
-    start = RePaintConfig.guided() if options.guided else RePaintConfig()
-    return replace(start, **{name: value for name, value in given.items() if value is not None})
+    given = {name: value for name, value in of_repaint.items() if value is not None}
+    if way == "trained":
+        if given:
+            names = ", ".join("--" + name.replace("resamplings", "num_resamplings").replace("_", "-") for name in given)
+            raise ValueError(f"{names} has no effect with --inpainting trained; add --inpainting repaint or guided")
+        return TrainedInpainting(options.num_inference_steps)
+    if options.num_inference_steps is not None:
+        given["num_inference_steps"] = options.num_inference_steps
+    return replace(RePaintConfig.guided() if way == "guided" else RePaintConfig(), **given)

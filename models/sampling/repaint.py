@@ -59,6 +59,11 @@ class TrainedInpainting:
 
     num_inference_steps: int | None = None
 
+    @property
+    def num_evaluations(self) -> int:
+        """Number of denoising steps; `PrITTIPipeline.resolve_inpainting` sets it."""
+        return self.num_inference_steps or 0
+
 
 @dataclass(frozen=True)
 class RePaintConfig:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from models.sampling.repaint import RePaintConfig
+from models.sampling.repaint import InpaintingConfig, RePaintConfig
 from models.scene import VEGETATION, Scene
 from pipelines.evaluation.seams import MEANINGS
 from pipelines.metrics.intervals import Estimate
@@ -25,7 +25,7 @@ def count_objects_per_ha(scenes: Iterable[Scene]) -> float:
 
 def make_seam_row(
     mode: str,
-    repaint: RePaintConfig | None,
+    repaint: InpaintingConfig | None,
     seams: int,
     objects_per_ha: float | None,
     ratios: Mapping[str, Estimate | None],
@@ -34,13 +34,14 @@ def make_seam_row(
 
     Real scenes have no options (`repaint` is None); their `mode` is a description.
     """
+    of_repaint = repaint if isinstance(repaint, RePaintConfig) else None
     row = {
         "neighbour_latents": mode,
         "steps": repaint and repaint.num_inference_steps,
-        "jump_length": repaint and repaint.jump_length,
-        "resamplings": repaint and repaint.resamplings,
-        "known_guidance": repaint and repaint.pseudoinverse_guidance,
-        "eta": repaint and repaint.eta,
+        "jump_length": of_repaint and of_repaint.jump_length,
+        "resamplings": of_repaint and of_repaint.resamplings,
+        "known_guidance": of_repaint and of_repaint.pseudoinverse_guidance,
+        "eta": of_repaint and of_repaint.eta,
         "evaluations": repaint and repaint.num_evaluations,
         "objects_per_ha": objects_per_ha,
         "seams": seams,

@@ -13,7 +13,7 @@ from models.composition.inpaint import Contents, select_around_objects, select_h
 from models.execution import SamplingExecution
 from models.labels import require_labels
 from models.pipeline import PrITTIPipeline
-from models.sampling.repaint import RePaintConfig
+from models.sampling.repaint import InpaintingConfig
 from models.scene import Scene, merge_scenes
 from pipelines.generation.sample import (
     Request,
@@ -94,7 +94,7 @@ class InpaintRequest(Request):
         variants: Number of variants per scene.
         label: Label of the generated region. None: the label of each scene is used.
         seed: Seed of the noise.
-        repaint: RePaint options.
+        repaint: How known parts are continued.
         guidance_scale: Scale of classifier-free guidance.
         execution: How the model runs.
         constraints: Whether constraints guide sampling. None: the value that the model stores.
@@ -105,7 +105,7 @@ class InpaintRequest(Request):
     variants: int
     label: str | None
     seed: int
-    repaint: RePaintConfig
+    repaint: InpaintingConfig
     guidance_scale: float
     execution: SamplingExecution = field(default_factory=SamplingExecution)
     constraints: bool | None = None
@@ -293,6 +293,7 @@ def inpaint_scenes(
         require_labels(pipeline.dit.config.label, [request.label])
     request = replace(
         request,
+        repaint=pipeline.resolve_inpainting(request.repaint),
         constraints=pipeline.resolve_constraints(request.constraints),
     )
     guard_generation_run(

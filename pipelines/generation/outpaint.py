@@ -27,7 +27,7 @@ from models.composition.outpaint import (
     rank_outward,
 )
 from models.execution import SamplingExecution
-from models.sampling.repaint import RePaintConfig
+from models.sampling.repaint import InpaintingConfig
 from models.scene import UNSET, Scene
 from models.tensors import make_empty_scene
 from pipelines.generation.sample import (
@@ -63,7 +63,7 @@ class OutpaintRequest(Request):
         seed: Seed of the noise.
         overlap: Overlap of neighbouring blocks as a fraction of a block.
         mode: Outpainting mode of `generate_blocks`. None: the mode that the pipeline stores.
-        repaint: RePaint options.
+        repaint: How known parts are continued.
         guidance_scale: Scale of classifier-free guidance.
         num_blocks: Four numbers of blocks to generate: ahead, behind, to the left, to the right.
         order: Order in which blocks are generated (a key of RANKS).
@@ -76,7 +76,7 @@ class OutpaintRequest(Request):
     seed: int
     overlap: float
     mode: str | None
-    repaint: RePaintConfig
+    repaint: InpaintingConfig
     guidance_scale: float
     num_blocks: tuple[int, int, int, int] = (1, 1, 1, 1)
     order: str = "outward"
@@ -426,6 +426,7 @@ def outpaint_scenes(
     request = replace(
         request,
         mode=request.mode or pipeline.config.neighbour_latents,
+        repaint=pipeline.resolve_inpainting(request.repaint),
         constraints=pipeline.resolve_constraints(request.constraints),
     )
     block_grid = request.make_block_grid(pipeline.latent_shape[-1])

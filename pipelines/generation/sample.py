@@ -153,9 +153,11 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
     defaults = {"constraints": False, "pag_scale": 0.0, "repair": False, "execution": execution}
     defaults |= {"labels_map": None, "free_blocks": "none", "tile_m": None}
     options = {name: value for name, value in options.items() if name not in defaults or value != defaults[name]}
-    # The sampler uses the noise scaling only if eta is not 1.
-    if "repaint" in options and options["repaint"]["eta"] != 1:
+    # RePaint uses the noise scaling only if eta is not 1.
+    if "repaint" in options and options["repaint"].get("eta") != 1:
         options["noise_scaling"] = pipeline.config.noise_scaling
+    if "repaint" in options and "eta" not in options["repaint"]:
+        options["sampler"], options["pag_scale"] = pipeline.scheduler_config.class_name, pipeline.pag_scale
     guard_run(options.pop("output"), request.source, request.run, options, parts)
 
 

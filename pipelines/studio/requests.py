@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from models.composition.extend import Side
 from models.composition.inpaint import Contents
-from models.sampling.repaint import RePaintConfig
+from models.sampling.repaint import InpaintingConfig, RePaintConfig, TrainedInpainting
 
 
 class StudioRequest(BaseModel):
@@ -26,7 +26,8 @@ class OpenRequest(StudioRequest):
     scene_id: str = Field(max_length=1000)
 
 
-GUIDED = RePaintConfig.guided()  # The defaults of --guided; only the number of steps is smaller in the studio.
+# The defaults of --inpainting guided; only the number of steps is smaller in the studio.
+GUIDED = RePaintConfig.guided()
 
 
 class SamplingRequest(StudioRequest):
@@ -48,7 +49,10 @@ class RepaintRequest(SamplingRequest):
     pseudoinverse_guidance: float = Field(GUIDED.pseudoinverse_guidance, ge=0, le=10)
     eta: float = Field(GUIDED.eta, ge=0, le=1)
 
-    def repaint(self) -> RePaintConfig:
+    def repaint(self, trained: bool) -> InpaintingConfig:
+        """Return how known parts are continued; a request that sets options of RePaint uses RePaint."""
+        if trained and not {"jump_length", "resamplings", "pseudoinverse_guidance", "eta"} & self.model_fields_set:
+            return TrainedInpainting(self.steps)
         return RePaintConfig(self.steps, self.jump_length, self.resamplings, self.pseudoinverse_guidance, self.eta)
 
 

@@ -292,7 +292,7 @@ class Studio:
             raise StudioError(str(error)) from error
         if not region.any():
             raise StudioError("the region contains no pixel of the scene; draw a larger region inside the scene")
-        label, repaint = self.choose_label(request, scene), request.repaint()
+        label, repaint = self.choose_label(request, scene), request.repaint(self.pipeline.dit.config.inpainting)
         blocks = len(split_region(self.pipeline, scene, region))
 
         def make(task: BackgroundTask) -> Scene:
@@ -322,7 +322,7 @@ class Studio:
         self.require_area(Grid(0.0, 0.0, scene.grid.resolution_m, rows, cols))
         across = cols if is_along else rows
         blocks = -(-(across - small.rows) // step) + 1
-        label, repaint = self.choose_label(request, scene), request.repaint()
+        label, repaint = self.choose_label(request, scene), request.repaint(self.pipeline.dit.config.inpainting)
 
         def make(task: BackgroundTask) -> Scene:
             self.use_constraints(request)
