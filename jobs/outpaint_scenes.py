@@ -5,9 +5,9 @@
     jobs/outpaint_scenes.py --extent-m 512 512 --num-actors 8            512 m x 512 m around it
     jobs/outpaint_scenes.py --blocks-ahead 9 --blocks-behind 0 --blocks-left 0 --blocks-right 0     along its street
     jobs/outpaint_scenes.py --input DIR --source town --split test --max-scenes 8 --num-actors 2
-    jobs/outpaint_scenes.py --guided                                     fast, with smoother seams
-    jobs/outpaint_scenes.py --guided --labels-map labels.json            one label per block
-    jobs/outpaint_scenes.py --guided --order colours --overlap 0.25 --extent-m 2000 2000 --tile-m 256     in tiles
+    jobs/outpaint_scenes.py --inpainting repaint                         as in the paper, slowly
+    jobs/outpaint_scenes.py --extent-m 496 496 --labels-map labels.json  one label per block
+    jobs/outpaint_scenes.py --extent-m 2000 2000 --tile-m 256            a city in tiles
 
 By default, the job adds eight blocks around a scene, as in the paper: four sides in one batch, then four corners. The
 job writes scene tables with source=generated-<run> and one GLB file per scene. With --tile-m, it writes one scene and
@@ -46,18 +46,18 @@ class Config(RePaintOptions):
     """Number of blocks to the left of the scene."""
     blocks_right: int = 1
     """Number of blocks to the right of the scene."""
-    overlap: float = 0.5
-    """Overlap of neighbouring blocks, as a share of the block size."""
-    order: Literal["outward", "colours"] = "outward"
-    """Order of blocks: outward from the scene (the paper), or four groups of independent blocks (needs --overlap <
-    0.5)."""
+    overlap: float | None = None
+    """Overlap of neighbouring blocks, as a share of the block size (default: 0.5 for outward, 0.25 for colours)."""
+    order: Literal["outward", "colours"] | None = None
+    """Order of blocks: outward from the scene, as in the paper, or four groups of independent blocks (needs --overlap <
+    0.5; default: outward for one block on each side, colours over longer distances, where outward drifts)."""
     labels_map: str = ""
     """JSON file with one list per row of blocks, farthest ahead first, each with one label per block, leftmost first;
     replaces --label."""
-    free_blocks: Literal["none", "off-street", "all"] = "none"
+    free_blocks: Literal["none", "off-street", "all"] | None = None
     """Blocks that are sampled as crops at any place and heading, instead of views of a vehicle: those that do not lie
     ahead of or behind the given scene (off-street), or all blocks. Only models with labels such as low-medium-free
-    distinguish both."""
+    distinguish both (default: none for one block on each side, all over longer distances)."""
     tile_m: float | None = None
     """Side of the tiles in metres, at least 64 (default: each result is written as one scene)."""
     neighbour_latents: Literal["reencode", "copy", "paper"] | None = None

@@ -41,7 +41,7 @@ class Config:
     num_inference_steps: int = 100
     """Number of denoising steps for sampling (paper: 250)."""
     outpaint_inference_steps: int = 50
-    """Number of denoising steps for outpainting with --inpainting guided (paper: 250 steps, each repeated ten times)."""
+    """Number of denoising steps of outpainting with --inpainting guided (paper: 250, each repeated ten times)."""
     num_actors: int = 2
     """Number of models that run in parallel during encoding, sampling and evaluation."""
     seed: int = 0

@@ -5,12 +5,12 @@
     jobs/sweep_seams.py --max-scenes 50 --settings 250 10 10 0 1 50 1 1 1 0      two settings of five numbers
     jobs/sweep_seams.py --max-scenes 50 --settings 50 1 1 1 0.3 --trained-steps 20     against a trained network
 
-A setting of RePaint has five numbers: denoising steps, jump length, resamplings, weight of pseudoinverse guidance, and eta (share
-of DDPM's noise). The paper's setting is 250 10 10 0 1, which needs 2,410 network evaluations per block. The last two
+A setting of RePaint has five numbers: denoising steps, jump length, resamplings, weight of pseudoinverse guidance, and
+eta (share of DDPM's noise). The paper's is 250 10 10 0 1, which needs 2,410 network evaluations per block. The last two
 rows are lines across the street in real scenes (the ceiling) and joined halves of unrelated real scenes (the control).
 
-The job writes the scenes (source=generated-<the five numbers> or generated-trained-<steps>), sweep.json, sweep.parquet and sweep.html. Run the same
-command again to resume after an interruption.
+The job writes the scenes (source=generated-<the five numbers> or generated-trained-<steps>), sweep.json, sweep.parquet
+and sweep.html. Run the same command again to resume after an interruption.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Config(GenerationOptions):
         (250, 10, 10, 0, 1), (250, 5, 5, 0, 1), (250, 1, 1, 0, 1), (50, 10, 10, 0, 1), (50, 5, 5, 0, 1),
         (50, 1, 1, 0, 1), (50, 1, 1, 1, 1), (50, 1, 1, 1, 0),
     )  # fmt: skip
-    """Settings of RePaint, five numbers each: steps, jump length, resamplings, weight of pseudoinverse guidance, eta."""
+    """Settings of RePaint: steps, jump length, resamplings, weight of pseudoinverse guidance, eta."""
     trained_steps: tuple[int, ...] = ()
     """Numbers of denoising steps without RePaint, for an inpainting model such as the released one (default: none)."""
     overlap: float = 0.5

@@ -25,7 +25,7 @@ from models.composition.deduplicate import find_lower_confidence_duplicates
 from models.composition.extend import Side, extend_scene
 from models.composition.generator import StepCallback
 from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
-from models.composition.outpaint import BlockIndex, outpaint_scene
+from models.composition.outpaint import BlockIndex, choose_arrangement, label_blocks, outpaint_scene
 from models.dit import DiT
 from models.execution import SamplingExecution
 from models.labels import FREE, find_label_index, split_label
@@ -932,13 +932,15 @@ class PrITTIPipeline:
         label: str | Mapping[BlockIndex, str],
         seed: int = 0,
         index: int = 0,
-        overlap: float = 0.5,
+        overlap: float | None = None,
         mode: str | None = None,
         num_blocks: tuple[int, int, int, int] = (1, 1, 1, 1),
         repaint: InpaintingConfig | None = None,
         guidance_scale: float = 1.0,
         callback_on_step_end: StepCallback | None = None,
         side: Side | None = None,
+        order: str | None = None,
+        free_blocks: str | None = None,
     ) -> Scene:
         """Extend a scene by generated blocks; the input content is unchanged (paper, supplement B.3).
 
@@ -948,7 +950,7 @@ class PrITTIPipeline:
             seed: Seed of the run.
             index: Index of the scene within the run.
             overlap: Fraction of a block that overlaps its neighbour; it must correspond to a whole number of latent
-                cells.
+                cells. None: see `models.composition.outpaint.choose_arrangement`; 0.5 with `side`.
             mode: "copy" copies the shifted latents of the neighbours. "reencode" transforms the decoded content of the
                 neighbours into the frame of the block and encodes it again. Object latents contain absolute centres,
                 which a copy does not change. "paper" is the outpainting of the paper: a copy, without blending of the
@@ -959,7 +961,11 @@ class PrITTIPipeline:
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `generate`.
             side: "ahead", "behind", "left" or "right". If `side` is set, the scene is extended only on this side, by
-                (1 - overlap) of a block, and `num_blocks` and `mode` are ignored: the neighbours are encoded again.
+                (1 - overlap) of a block, and `num_blocks`, `mode`, `order` and `free_blocks` are ignored: the
+                neighbours are encoded again.
+            order: "outward" or "colours"; None: see `choose_arrangement`.
+            free_blocks: Blocks that count as crops at any place and heading, instead of views of a vehicle: "none",
+                "off-street" or "all"; None: see `choose_arrangement`. Ignored if `label` is a mapping.
 
         Returns:
             One scene that covers all blocks.
@@ -970,15 +976,19 @@ class PrITTIPipeline:
         if side is not None:
             if not isinstance(label, str):
                 raise ValueError("to extend a scene on one side, pass one label for all blocks")
-            return extend_scene(self, scene, side, label, seed, overlap, repaint, guidance_scale, callback_on_step_end)
+            share = 0.5 if overlap is None else overlap
+            return extend_scene(self, scene, side, label, seed, share, repaint, guidance_scale, callback_on_step_end)
         self.require_grid(scene)
+        arrangement = choose_arrangement(num_blocks, order, overlap, free_blocks)
+        if isinstance(label, str):
+            label = label_blocks(self.dit.config.label, label, num_blocks, arrangement.free_blocks)
         return outpaint_scene(
             self,
             scene,
             label,
             seed,
             index,
-            overlap,
+            arrangement,
             mode or self.config.neighbour_latents,
             num_blocks,
             repaint,

@@ -13,26 +13,29 @@ from jobs.support.model_directories import find_pipeline_directory, read_label_k
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import make_execution, make_inpainting_config, select_scenes
-from models.composition.outpaint import HARDLY_KNOWN, label_blocks
+from models.composition.outpaint import HARDLY_KNOWN, Arrangement, choose_arrangement, label_blocks
 from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
 from pipelines.runtime import storage
 
 BLOCK_M = 64.0  # size of the scenes in every dataset (paper, Sec. 3.1)
 
 
-def count_blocks(config: Config) -> tuple[int, int, int, int]:
-    """Return the numbers of blocks ahead, behind, left and right of the scene.
+def arrange_blocks(config: Config) -> tuple[tuple[int, int, int, int], Arrangement]:
+    """Return the numbers of blocks ahead, behind, left and right of the scene, and their arrangement.
 
     Raises:
         ValueError: A number is negative, or all numbers are 0.
     """
+    chosen = config.order, config.overlap, config.free_blocks
     if config.extent_m is None:
         counts = config.blocks_ahead, config.blocks_behind, config.blocks_left, config.blocks_right
     else:
-        step_m = BLOCK_M * (1 - config.overlap)
+        is_far = max(config.extent_m) > 2 * BLOCK_M  # The paper's blocks on each side add half a block.
+        overlap = choose_arrangement((1 + is_far,) * 4, *chosen).overlap
+        step_m = BLOCK_M * (1 - overlap)
         if not 0 < step_m <= BLOCK_M or min(config.extent_m) < BLOCK_M:
             raise ValueError(
-                f"--extent-m is {config.extent_m}, --overlap is {config.overlap}: "
+                f"--extent-m is {config.extent_m}, --overlap is {overlap}: "
                 f"expected an extent of at least {BLOCK_M} m and an overlap in [0, 1)"
             )
         sides = [ceil((extent - BLOCK_M) / 2 / step_m - 1e-9) for extent in config.extent_m]
@@ -42,12 +45,12 @@ def count_blocks(config: Config) -> tuple[int, int, int, int]:
             f"--blocks-ahead, --blocks-behind, --blocks-left and --blocks-right are {counts}: "
             "expected numbers of at least 0, and at least one block"
         )
-    return counts
+    return counts, choose_arrangement(counts, *chosen)
 
 
-def report_extent(config: Config, counts: tuple[int, int, int, int]) -> None:
+def report_extent(config: Config, counts: tuple[int, int, int, int], overlap: float) -> None:
     """Print the size of the result if it differs from --extent-m."""
-    step_m = BLOCK_M * (1 - config.overlap)
+    step_m = BLOCK_M * (1 - overlap)
     actual = tuple(BLOCK_M + (a + b) * step_m for a, b in (counts[:2], counts[2:]))
     if config.extent_m and max(abs(a - b) for a, b in zip(actual, config.extent_m, strict=True)) > 1e-6:
         wanted, made = (" x ".join(f"{length:g}" for length in size) for size in (config.extent_m, actual))
@@ -75,8 +78,8 @@ def read_labels_map(path: str, kind: str, counts: tuple[int, int, int, int]) -> 
 
 def outpaint(config: Config) -> list[str]:
     """Extend scenes and write them; return the path of each scene's table with the known ground in each block."""
-    counts = count_blocks(config)
-    report_extent(config, counts)
+    counts, arrangement = arrange_blocks(config)
+    report_extent(config, counts, arrangement.overlap)
     check_outpaint_scenes(config)
     selection, model = select_scenes(config), find_pipeline_directory(config.model)
     count = sum(len(rows) for _, rows in selection.shards())
@@ -86,17 +89,17 @@ def outpaint(config: Config) -> list[str]:
         run=config.run,
         label=config.label or None,
         labels_map=read_labels_map(config.labels_map, read_label_kind(model), counts) if config.labels_map else None,
-        free_blocks=config.free_blocks,
+        free_blocks=arrangement.free_blocks,
         tile_m=config.tile_m,
         seed=config.seed,
-        overlap=config.overlap,
+        overlap=arrangement.overlap,
         mode=config.neighbour_latents,
         repaint=make_inpainting_config(config, model),
         execution=make_execution(config),
         guidance_scale=config.guidance_scale,
         constraints=config.constraints,
         num_blocks=counts,
-        order=config.order,
+        order=arrangement.order,
         batch_size=config.batch_size,
     )
     with hold_output(request.output, request.source, config):

@@ -34,6 +34,10 @@ class InfiniteScene:
         mode: "reencode", "copy" or "paper"; see `PrITTIPipeline.outpaint`.
         repaint: Options of inpainting; None: see `resolve_inpainting`.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
+        scene: Content of block (0, 0), on the model's grid. None: block (0, 0) is generated.
+        scene_index: Index of the scene. With the same scene, seed, index and labels, each block equals that of
+            `PrITTIPipeline.outpaint` in the order "colours", up to rounding. Blocks at the border of the latter are
+            equal if its numbers of blocks are even.
 
     Raises:
         ValueError: The label is unknown to the model, or the overlap is 0.5 or more.
@@ -48,12 +52,15 @@ class InfiniteScene:
         mode: str = "reencode",
         repaint: InpaintingConfig | None = None,
         guidance_scale: float = 1.0,
+        scene: Scene | None = None,
+        scene_index: int = 0,
     ) -> None:
-        self.model, self.label, self.seed = model, label, seed
+        self.model, self.label, self.seed, self.scene_index = model, label, seed, scene_index
         self.options: dict[str, Any] = {"mode": mode, "repaint": repaint, "guidance_scale": guidance_scale}
         block_grid = BlockGrid.from_overlap(model.latent_shape[-1], overlap, rank=rank_four_colors, num_blocks=None)
         self.composer = BlockComposer(block_grid, model.spec, model.encode)
         self.blocks: dict[BlockIndex, SceneBlock] = {}
+        self.scene = scene
         model.label_tensor([self.label_of((0, 0))])
 
     def label_of(self, index: BlockIndex) -> str:
@@ -76,6 +83,8 @@ class InfiniteScene:
         Returns:
             The block.
         """
+        if index == (0, 0) and self.scene is not None:
+            self.blocks.setdefault(index, SceneBlock(self.scene, self.model.encode([self.scene])[0]))
         if index not in self.blocks:
             known = {other: self.get_block(other) for other, _ in self.composer.block_grid.known_cells(index)}
             if known:
@@ -85,7 +94,15 @@ class InfiniteScene:
             # Generate one block at a time. Rounding differs between batch sizes. If blocks were generated in batches,
             # the content of a block would depend on the requests.
             self.blocks |= generate_blocks(
-                self.model, self.composer, [index], known, like, {index: label}, self.seed, **self.options
+                self.model,
+                self.composer,
+                [index],
+                known,
+                like,
+                {index: label},
+                self.seed,
+                self.scene_index,
+                **self.options,
             )
         return self.blocks[index]
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby, product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -68,6 +68,56 @@ def rank_four_colors(index: BlockIndex) -> int:
         Rank from 0 to 3. Blocks of the same rank are at least two steps apart.
     """
     return index[0] % 2 + 2 * (index[1] % 2)
+
+
+RANKS: dict[str, Callable[[BlockIndex], int]] = {"outward": rank_outward, "colours": rank_four_colors}
+
+
+class Arrangement(NamedTuple):
+    """How blocks are arranged.
+
+    Attributes:
+        order: Order of the blocks, a key of RANKS.
+        overlap: Overlap of neighbouring blocks as a fraction of a block.
+        free_blocks: Blocks that count as crops at any place and heading, a key of FREE_BLOCKS.
+    """
+
+    order: str
+    overlap: float
+    free_blocks: str
+
+
+def choose_arrangement(
+    num_blocks: tuple[int, int, int, int],
+    order: str | None = None,
+    overlap: float | None = None,
+    free_blocks: str | None = None,
+) -> Arrangement:
+    """Return how blocks are arranged.
+
+    By default, one block on each side is arranged as in the paper: outward, with an overlap of 0.5, and as views of a
+    vehicle. Over longer distances, the content would drift. There, the order is that of four colours, the overlap is
+    0.25, and the blocks are crops at any place.
+
+    Args:
+        num_blocks: Number of blocks ahead of, behind, to the left of and to the right of block (0, 0).
+        order: Order of the blocks, a key of RANKS; None: the default.
+        overlap: Overlap of neighbouring blocks; None: 0.25 for colours and 0.5 for outward.
+        free_blocks: Blocks that count as crops at any place and heading, a key of FREE_BLOCKS; None: the default.
+
+    Returns:
+        The arrangement.
+
+    Raises:
+        ValueError: The order is unknown.
+    """
+    is_far = max(num_blocks) > 1
+    order = order or ("colours" if is_far else "outward")
+    if order not in RANKS:
+        raise ValueError(f"order is {order!r}, expected one of: {', '.join(RANKS)}")
+    if overlap is None:
+        overlap = 0.25 if order == "colours" else 0.5
+    return Arrangement(order, overlap, free_blocks or ("all" if is_far else "none"))
 
 
 @dataclass(frozen=True)
@@ -626,7 +676,7 @@ def outpaint_scene(
     label: str | Mapping[BlockIndex, str],
     seed: int,
     scene_index: int,
-    overlap: float,
+    arrangement: Arrangement,
     mode: str,
     num_blocks: tuple[int, int, int, int],
     repaint: InpaintingConfig | None,
@@ -641,7 +691,7 @@ def outpaint_scene(
         label: One label for all blocks, or a mapping from block index to label.
         seed: Seed of the noise.
         scene_index: Index of the scene. The noise depends on the seed and this index.
-        overlap: Fraction of a block that overlaps its neighbour; it must correspond to a whole number of latent cells.
+        arrangement: Order and overlap of the blocks; its overlap must correspond to a whole number of latent cells.
         mode: One of MODES.
         num_blocks: Number of blocks to add ahead, behind, to the left and to the right.
         repaint: Options of inpainting; None: see `resolve_inpainting`.
@@ -654,7 +704,9 @@ def outpaint_scene(
     Raises:
         ValueError: The overlap is not a whole number of cells, or `mode` is unknown.
     """
-    block_grid = BlockGrid.from_overlap(model.latent_shape[-1], overlap, num_blocks=num_blocks)
+    block_grid = BlockGrid.from_overlap(
+        model.latent_shape[-1], arrangement.overlap, rank=RANKS[arrangement.order], num_blocks=num_blocks
+    )
     composer = BlockComposer(block_grid, model.spec, model.encode, find_ground_height(scene, 0.0, 0.0))
     blocks = {(0, 0): SceneBlock(scene, model.encode([scene])[0])}
     for group in block_grid.group_by_rank(index for index in block_grid.indices() if index not in blocks):

@@ -14,14 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.distance import jensenshannon
 
-from models.composition.outpaint import BlockGrid
+from models.composition.outpaint import RANKS, BlockGrid
 from models.labels import ANY, FREE
 from models.scene import DENSITIES, Grid, Scene
 from models.tensors import resample_scene_ground
 from pipelines.evaluation.evaluate import compute_scene_means
 from pipelines.evaluation.features import READER_CPUS
 from pipelines.evaluation.traffic import Traffic, simulate_traffic
-from pipelines.generation.outpaint import RANKS
 from pipelines.metrics.cities import (
     HECTARE_M2,
     QUANTITIES,

@@ -15,6 +15,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from models.composition.outpaint import (
+    RANKS,
     BlockComposer,
     BlockGrid,
     BlockIndex,
@@ -23,8 +24,6 @@ from models.composition.outpaint import (
     find_ground_height,
     generate_blocks,
     label_blocks,
-    rank_four_colors,
-    rank_outward,
 )
 from models.execution import SamplingExecution
 from models.sampling.repaint import InpaintingConfig
@@ -45,7 +44,6 @@ from pipelines.runtime.resources import make_model_resources, require_room
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, find_unwritten, require_written
 
-RANKS = {"outward": rank_outward, "colours": rank_four_colors}
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")
 MAX_RETRIES = 3  # Number of retries for a block whose process died.
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import random_scene
 
-from models.composition.outpaint import BlockGrid
+from models.composition.outpaint import RANKS, BlockGrid
 from models.scene import VEGETATION, VEHICLES
 from pipelines.evaluation.cities import (
     CityResult,
@@ -20,7 +20,6 @@ from pipelines.evaluation.cities import (
     read_run_record,
 )
 from pipelines.evaluation.traffic import Traffic
-from pipelines.generation.outpaint import RANKS
 from pipelines.metrics.cities import QUANTITIES, SEAM_RECORD_SHAPE
 from pipelines.metrics.validity import judge_densities
 from pipelines.reporting.city_report import CELL_PX, draw_map

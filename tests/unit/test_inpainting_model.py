@@ -1,0 +1,182 @@
+"""Tests of transformers that read the known part of a scene: masks, training, sampling and outpainting."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers import QUICK, random_scene, small_spec, tiny_pipeline
+
+from models.composition.infinite import InfiniteScene
+from models.composition.inpaint import make_latent_mask
+from models.composition.outpaint import choose_arrangement, label_blocks
+from models.dit import DiT
+from models.pipeline import PrITTIPipeline
+from models.presets import DIT_PRESETS
+from models.sampling.diffusion import InpaintCondition, SamplingSchedule, SceneNoise, join_known, sample, with_known
+from models.sampling.known_regions import NUM_UNIFORM, ONE_CONTENT, make_training_masks
+from models.sampling.repaint import RePaintConfig, TrainedInpainting
+from models.training import DiffusionLossConfig, make_dit_settings, make_dit_trainer
+
+SIZE = 8
+
+
+def make_inpainting(pipeline: PrITTIPipeline) -> PrITTIPipeline:
+    """Return the same pipeline with random weights for the known part."""
+    dit = DiT(**(dict(pipeline.dit.config) | {"inpainting": True, "schedule": pipeline.dit.diffusion}))
+    torch.manual_seed(1)
+    state = pipeline.dit.state_dict() | {"known_in.weight": 0.05 * torch.randn(32, 2 * dit.config.channels, 2, 2)}
+    dit.load_state_dict(state)
+    made = PrITTIPipeline(pipeline.lvae, dit, num_inference_steps=10)
+    made.set_progress_bar_config(disable=True)
+    return made
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    return make_inpainting(tiny_pipeline(small_spec()))
+
+
+def draw_condition(shape, known_cols: int, count: int = 2) -> InpaintCondition:
+    generator = torch.Generator().manual_seed(4)
+    mask = torch.ones(count, *shape)
+    mask[..., :known_cols] = 0
+    return InpaintCondition(torch.randn(mask.shape, generator=generator), mask)
+
+
+# ------------------------------------------------------------------------------------------------------------- masks
+
+
+def test_training_masks_have_the_known_regions_of_their_uses():
+    uniform = torch.rand(4000, NUM_UNIFORM, generator=torch.Generator().manual_seed(0))
+    known = 1 - make_training_masks(uniform, 6, SIZE)
+    ground, objects = known[:, 0], known[:, -1]
+    assert torch.equal(known, torch.cat([ground[:, None].expand(-1, 3, -1, -1)] + 3 * [objects[:, None]], dim=1))
+    shares = {
+        "nothing": (known == 0).flatten(1).all(1),
+        "all ground": (ground == 1).flatten(1).all(1) & ~(objects == 1).flatten(1).all(1),
+        "all objects": (objects == 1).flatten(1).all(1) & ~(ground == 1).flatten(1).all(1),
+        "four sides": (ground[:, [0, -1]] == 1).all(2).all(1) & (ground[:, :, [0, -1]] == 1).all(2).all(1),
+        "one side": (ground[:, 0] == 1).all(1) & (ground[:, -1] == 0).any(1),
+    }
+    share = {name: float(of.float().mean()) for name, of in shares.items()}
+    assert share["nothing"] == pytest.approx(0.35 * (1 - 2 * ONE_CONTENT), abs=0.03)
+    assert all(0.8 * ONE_CONTENT < share[name] <= 1.1 * ONE_CONTENT for name in ("all ground", "all objects")), share
+    assert share["four sides"] > 0.1 and share["one side"] > 0.05
+
+
+# ---------------------------------------------------------------------------------------------------------- training
+
+
+def test_network_starts_without_regard_to_the_known_part():
+    made = DiT(channels=2, size=SIZE, width=32, depth=1, heads=2, inpainting=True)
+    torch.nn.init.normal_(made.patch_out.weight)
+    latent, timestep, label = torch.randn(2, 2, SIZE, SIZE), torch.tensor([5, 900]), torch.tensor([0, 1])
+    joined = join_known(latent, draw_condition((2, SIZE, SIZE), 4))
+    assert torch.equal(made(joined, timestep, label), made(latent, timestep, label))
+    torch.nn.init.normal_(made.known_in.weight)
+    assert not torch.allclose(made(joined, timestep, label), made(latent, timestep, label))
+    with pytest.raises(ValueError, match="without --inpainting"):
+        DiT(channels=2, size=SIZE, width=32, depth=1, heads=2)(joined, timestep, label)
+
+
+def test_trained_network_continues_the_known_part():
+    """In the data, all cells of a latent are equal. A network with half of the cells known must find the other half."""
+    torch.manual_seed(0)
+    dit = DiT(channels=2, size=SIZE, width=32, depth=1, heads=2, prediction="v_prediction", inpainting=True)
+    settings = replace(make_dit_settings(DIT_PRESETS["smoke"], 0), steps=250, learning_rate=3e-3, warmup_steps=10)
+    trainer = make_dit_trainer(dit, settings, 0.1, torch.device("cpu"), loss_config=DiffusionLossConfig())
+    draws = torch.Generator().manual_seed(0)
+    for step in range(250):
+        mean = torch.randn(32, 2, 1, 1, generator=draws).expand(-1, -1, SIZE, SIZE).contiguous()
+        arrays = {"mean": mean, "logvar": torch.full_like(mean, -20.0), "label": torch.zeros(32, dtype=torch.long)}
+        trainer.step(arrays, range(32 * step, 32 * (step + 1)))
+    truth = torch.randn(16, 2, 1, 1, generator=draws).expand(-1, -1, SIZE, SIZE)
+    mask = torch.ones(16, 2, SIZE, SIZE)
+    mask[..., :4] = 0
+    schedule, label = SamplingSchedule(dit.diffusion, 50), torch.zeros(16, dtype=torch.long)
+    errors = {}
+    for name, condition in {"known": InpaintCondition(truth, mask), "nothing": None}.items():
+        model = with_known(dit, condition, dit.diffusion) if condition else dit
+        noise = SceneNoise(0, range(16), (2, SIZE, SIZE), "cpu")
+        errors[name] = float((sample(model, schedule, noise, label) - truth)[..., 4:].square().mean())
+    assert errors["known"] < 0.4 and errors["nothing"] > 1.2, errors
+
+
+# ---------------------------------------------------------------------------------------------------------- sampling
+
+
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm++", "sde-dpm++"])
+def test_every_sampler_keeps_the_known_part(pipeline, sampler):
+    pipeline.use_sampler(sampler)
+    condition = draw_condition(pipeline.latent_shape, 3)
+    arguments = ["low", "high"], 5, [0, 1]
+    made = pipeline.inpaint_latents(condition, *arguments, TrainedInpainting(10))
+    assert torch.equal(made[..., :3], condition.latent[..., :3])
+    other = InpaintCondition(condition.latent * 2, condition.mask)
+    changed = pipeline.inpaint_latents(other, *arguments, TrainedInpainting(10))
+    assert not torch.allclose(made[..., 3:], changed[..., 3:])
+    one = InpaintCondition(condition.latent[1:], condition.mask[1:])
+    alone = pipeline.inpaint_latents(one, ["high"], 5, [1], TrainedInpainting(10))
+    assert torch.allclose(alone[0], made[1], atol=1e-4)
+
+
+def test_empty_known_part_is_ordinary_sampling(pipeline):
+    pipeline.use_sampler("dpm++")
+    condition = draw_condition(pipeline.latent_shape, 0)
+    made = pipeline.inpaint_latents(condition, ["low", "high"], 5, [0, 1], TrainedInpainting(8))
+    assert torch.allclose(made, pipeline.sample_latents(["low", "high"], 5, [0, 1], 8), atol=1e-5)
+
+
+def test_default_of_inpainting_depends_on_the_model(pipeline):
+    plain = tiny_pipeline(small_spec())
+    assert plain.resolve_inpainting(None) == RePaintConfig() and plain.resolve_inpainting(QUICK) == QUICK
+    assert pipeline.resolve_inpainting(None) == TrainedInpainting(pipeline.config.num_inference_steps)
+    assert pipeline.resolve_inpainting(TrainedInpainting(7)).num_evaluations == 7
+    with pytest.raises(ValueError, match="no inpainting model"):
+        plain.inpaint_latents(draw_condition(plain.latent_shape, 3), ["low", "low"], 0, [0, 1], TrainedInpainting(5))
+
+
+def test_pipeline_with_inpainting_survives_saving(pipeline, tmp_path):
+    pipeline.save_pretrained(tmp_path)
+    loaded = PrITTIPipeline.from_pretrained(tmp_path)
+    assert loaded.dit.config.inpainting
+    assert torch.equal(loaded.dit.known_in.weight, pipeline.dit.known_in.weight)
+
+
+def test_region_is_inpainted_around_known_objects(pipeline):
+    pipeline.use_sampler("dpm++")
+    scene = random_scene(2, grid=pipeline.spec.grid)
+    region = scene.grid.x_m()[:, None] + 0 * scene.grid.y_m() > 32
+    (made,) = pipeline.inpaint([scene], [region], ["low"], repaint=TrainedInpainting(6))
+    assert (made.occupied[:, ~region] == scene.occupied[:, ~region]).all()
+    mask = make_latent_mask([region], pipeline.latent_shape, "both")
+    assert 0 < float(mask.mean()) < 1
+
+
+# ------------------------------------------------------------------------------------------------------- outpainting
+
+
+def test_arrangement_changes_with_the_distance():
+    assert choose_arrangement((1, 1, 1, 1)) == ("outward", 0.5, "none")
+    assert choose_arrangement((2, 0, 0, 0)) == ("colours", 0.25, "all")
+    assert choose_arrangement((2, 0, 0, 0), "outward") == ("outward", 0.5, "all")
+    assert choose_arrangement((1, 1, 1, 1), overlap=0.25, free_blocks="all") == ("outward", 0.25, "all")
+    with pytest.raises(ValueError, match="order is 'spiral', expected one of: outward, colours"):
+        choose_arrangement((1, 1, 1, 1), "spiral")
+
+
+def test_infinite_scene_has_the_blocks_of_the_large_scene(pipeline):
+    """The blocks at the border of the large scene are equal too, because its numbers of blocks are even."""
+    pipeline.use_sampler("dpm++")
+    scene = random_scene(2, grid=pipeline.spec.grid)
+    steps, options = (2, 0, 0, 2), {"repaint": TrainedInpainting(4), "mode": "reencode"}
+    large = pipeline.outpaint(scene, "low", seed=3, index=1, num_blocks=steps, **options)
+    assert large.grid.rows == 32 + 2 * 24
+    labels = label_blocks(pipeline.dit.config.label, "low", steps, "all")
+    infinite = InfiniteScene(pipeline, labels.__getitem__, seed=3, scene=scene, scene_index=1, **options)
+    infinite.drop_block((0, 0))
+    whole = infinite.composer.stitch({index: infinite.get_block(index) for index in labels}, scene)
+    # The large scene is generated in batches, which changes the rounding.
+    assert np.mean(whole.occupied != large.occupied) < 1e-3 and len(whole) == len(large)
+    assert np.abs(whole.center_m - large.center_m).max() < 0.01
