@@ -64,8 +64,8 @@ def evaluate_city(config: Config) -> dict:
     dataset = Dataset.open(resolve_path(config.real, "datasets", "town"))
     output = resolve_path(config.output, "evaluations", "city")
     runs = {GENERATED: config.run} | ({CONTROL: config.control_run} if config.control_run else {})
-    cities = {side: list_cities(generated, f"generated-{run}") for side, run in runs.items()}
     records = {side: read_run_record(generated, f"generated-{run}") for side, run in runs.items()}
+    cities = {side: list_cities(generated, f"generated-{run}", records[side]) for side, run in runs.items()}
     labels = {side: find_label(listed, records[side], config.label) for side, listed in cities.items()}
     if len(set(labels.values())) > 1:
         shown = " and ".join(f"{format_label(label)} ({runs[side]})" for side, label in labels.items())
@@ -88,7 +88,8 @@ def evaluate_city(config: Config) -> dict:
         CityRequest(
             side,
             number,
-            (city.shard, city.row),
+            city.tiles,
+            corner_m=records[side].corner_m,
             seams_m=records[side].seams_m,
             traffic=traffic,
             label=label,
@@ -97,7 +98,7 @@ def evaluate_city(config: Config) -> dict:
         for number, city in enumerate(listed)
     ]
     jobs += [
-        CityRequest(CEILING, k, (None, TOWN_SEEDS_START + k), extent_m, traffic=traffic, label=label)
+        CityRequest(CEILING, k, town_seed=TOWN_SEEDS_START + k, extent_m=extent_m, traffic=traffic, label=label)
         for k in range(config.num_towns)
     ]
     with hold_output(output, "evaluation", config):
@@ -142,31 +143,37 @@ def evaluate_city(config: Config) -> dict:
 
 
 class City(NamedTuple):
-    """Place of a large scene in a dataset directory, its shorter side (m), the size of its pixels (m) and its label."""
+    """Shard and row of a large scene, or of its tiles; its shorter side (m), the size of its pixels (m), its label."""
 
-    shard: Shard
-    row: int
+    tiles: tuple[tuple[Shard, int], ...]
     side_m: float
     resolution_m: float
     label: Label
 
 
-def list_cities(root: str, source: str) -> list[City]:
-    """List the large scenes of a source.
+def list_cities(root: str, source: str, record: RunRecord) -> list[City]:
+    """List the large scenes of a source; the tiles of one scene are consecutive and have the same frame.
 
     Raises:
         ValueError: The source has no scene.
     """
-    found = []
+    found: dict[int, list[tuple[dict, dict, tuple[Shard, int]]]] = {}
     for shard in find_shards(root, "scenes", source, None):
-        scenes = shard.read("scenes", ["vegetation_density", "vehicle_density"]).to_pylist()
+        scenes = shard.read("scenes", ["frame", "vegetation_density", "vehicle_density"]).to_pylist()
         rasters = shard.read("rasters", ["rows", "cols", "resolution_m"]).to_pylist()
         for row, (scene, raster) in enumerate(zip(scenes, rasters, strict=True)):
-            side_m = min(raster["rows"], raster["cols"]) * raster["resolution_m"]
-            found.append(City(shard, row, side_m, raster["resolution_m"], tuple(scene.values())))
+            number = scene.pop("frame") if record.corner_m else len(found)
+            found.setdefault(number, []).append((scene, raster, (shard, row)))
     if not found:
         raise ValueError(f"{root}: source {source} holds no scene")
-    return found
+    cities = []
+    for number in sorted(found):
+        parts = found[number]
+        resolution_m = parts[0][1]["resolution_m"]
+        sides_m = record.size_m or tuple(parts[0][1][name] * resolution_m for name in ("rows", "cols"))
+        label = parts[0][0]["vegetation_density"], parts[0][0]["vehicle_density"]
+        cities.append(City(tuple(place for *_, place in parts), min(sides_m), resolution_m, label))
+    return cities
 
 
 def find_label(cities: list[City], record: RunRecord, option: str) -> Label:

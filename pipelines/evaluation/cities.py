@@ -21,6 +21,7 @@ from models.tensors import resample_scene_ground
 from pipelines.evaluation.evaluate import compute_scene_means
 from pipelines.evaluation.features import READER_CPUS
 from pipelines.evaluation.traffic import Traffic, simulate_traffic
+from pipelines.generation.tiles import join_tiles
 from pipelines.metrics.cities import (
     HECTARE_M2,
     QUANTITIES,
@@ -86,7 +87,9 @@ class CityRequest:
     Attributes:
         side: Name of the set.
         number: Number within the set.
-        source: Shard and row of the scene, or (None, seed) for a procedural town.
+        tiles: Shard and row of the scene, or of each of its tiles; none for a procedural town.
+        town_seed: Seed of a procedural town.
+        corner_m: x of the rear border and y of the right border of a scene in tiles, in the frame of the city (m).
         extent_m: Side of a procedural town (m).
         seams_m: Positions of seams along x and y in the frame of the city (m). Positions outside the city are ignored.
         traffic: Whether to simulate traffic with SUMO.
@@ -96,7 +99,9 @@ class CityRequest:
 
     side: str
     number: int
-    source: tuple[Shard | None, int]
+    tiles: tuple[tuple[Shard, int], ...] = ()
+    town_seed: int = 0
+    corner_m: tuple[float, float] | None = None
     extent_m: float = 0.0
     seams_m: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
     traffic: bool = False
@@ -136,10 +141,14 @@ class RunRecord(NamedTuple):
     Attributes:
         label: Requested densities of vegetation and vehicles; None: unknown, or the run took the label of each scene.
         seams_m: Positions of seams along x and y (`find_seams_m`); none if they are unknown.
+        corner_m: x of the rear border and y of the right border of scenes in tiles (m); None if scenes are whole.
+        size_m: Length and width of scenes in tiles (m); None if scenes are whole.
     """
 
     label: tuple[str | None, str | None] | None = None
     seams_m: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+    corner_m: tuple[float, float] | None = None
+    size_m: tuple[float, float] | None = None
 
 
 def read_run_record(root: str, source: str) -> RunRecord:
@@ -150,7 +159,7 @@ def read_run_record(root: str, source: str) -> RunRecord:
         source: Source of the run, such as generated-outpainted.
 
     Returns:
-        Label and seams; nothing is known without a record.
+        What the record says; nothing is known without a record.
     """
     path = storage.join_uri(root, f"{source}.json")
     options = storage.read_json(path) if storage.exists(path) else {}
@@ -160,7 +169,15 @@ def read_run_record(root: str, source: str) -> RunRecord:
     grid = BlockGrid.from_overlap(
         FINE_CELLS, options["overlap"], rank=RANKS[options["order"]], num_blocks=tuple(options["num_blocks"])
     )
-    return RunRecord(label, find_seams_m(grid, WINDOW_M / FINE_CELLS))
+    seams_m = find_seams_m(grid, WINDOW_M / FINE_CELLS)
+    if not options.get("tile_m"):
+        return RunRecord(label, seams_m)
+    ahead, behind, left, right = options["num_blocks"]
+    step_m = WINDOW_M * (1 - options["overlap"])
+    corner_m = -behind * step_m, -WINDOW_M / 2 - right * step_m
+    return RunRecord(
+        label, seams_m, corner_m, (WINDOW_M + (ahead + behind) * step_m, WINDOW_M + (left + right) * step_m)
+    )
 
 
 def parse_label(text: str) -> tuple[str | None, str | None]:
@@ -212,16 +229,19 @@ def measure_city_windows(
     Returns:
         Measures of the windows and of the whole city.
     """
-    shard, row = job.source
-    city = shard.scenes([row])[0] if shard else make_large_scene(row, job.extent_m, resolution_m)
+    if job.tiles:
+        tiles = [shard.scenes([row])[0] for shard, row in job.tiles]
+        city = join_tiles(tiles, *job.corner_m) if job.corner_m else tiles[0]
+    else:
+        city = make_large_scene(job.town_seed, job.extent_m, resolution_m)
     measured = measure_city(city, CENTER_M)
     windows: dict[str, list[Scene]] = {}
     rows = []
     for window, values in zip(measured.windows, measured.quantities, strict=True):
         scene, place = window.scene, (window.ahead * WINDOW_M, window.left * WINDOW_M)
         judged = judge_densities(scene, dataset.vegetation, dataset.vehicle)
-        kept = bool(shard) or all(wanted in (None, own) for wanted, own in zip(job.label, judged, strict=True))
-        vegetation, vehicle = job.label if shard else judged
+        kept = bool(job.tiles) or all(wanted in (None, own) for wanted, own in zip(job.label, judged, strict=True))
+        vegetation, vehicle = job.label if job.tiles else judged
         own_m = find_origin_level_m(scene)
         if np.isfinite(own_m):
             scene = scene.translate(0.0, 0.0, level_m - own_m)
