@@ -6,21 +6,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-NUM_UNIFORM = 10  # Random numbers per sample that `make_training_masks` needs.
+NUM_UNIFORM = 13  # Random numbers per sample that `make_training_masks` needs.
 NOTHING, STRIPS = 0.35, 0.45  # Shares of samples without a known region, and with known strips; the others have a hole.
 SIDE = 0.6  # Probability that a strip along one side is known.
 ONE_CONTENT = 0.1  # Shares of samples that also know all of the ground, and all objects.
+BAND = 0.15  # Share of samples that also know the ground of a straight band, such as a sketched road.
+BAND_CELLS = 3.0, 9.0  # Width of a band.
 
 
 def make_training_masks(
-    uniform: Float[Tensor, "b 10"], channels: int, size: int
+    uniform: Float[Tensor, "b 13"], channels: int, size: int
 ) -> Float[Tensor, "b channels size size"]:
     """Make masks of latents from random numbers.
 
     The masks are those of outpainting and inpainting: nothing is known; strips of up to half a block along one or more
     sides are known, as on a grid of blocks; or everything outside of a rectangle is known. In addition, some samples
-    know all of the ground, or all objects. As in `models.composition.inpaint.make_latent_mask`, the first half of the
-    channels belongs to the ground.
+    know all of the ground, all objects, or the ground of a band in any direction. As in
+    `models.composition.inpaint.make_latent_mask`, the first half of the channels belongs to the ground.
 
     Args:
         uniform: Random numbers between 0 and 1, NUM_UNIFORM per sample.
@@ -30,7 +32,7 @@ def make_training_masks(
     Returns:
         Masks; 1 marks values to generate, 0 marks known values.
     """
-    kind, sides, corners, content = uniform.split([1, 4, 4, 1], dim=1)
+    kind, sides, corners, content, line = uniform.split([1, 4, 4, 1, 3], dim=1)
     cell = torch.arange(size, device=uniform.device)
     # A number below SIDE determines the width of the strip, from 1 cell to half of the cells.
     width = torch.where(sides < SIDE, (sides / SIDE * (size // 2)).long() + 1, 0)
@@ -43,7 +45,14 @@ def make_training_masks(
     kind = kind[:, :, None]
     known = torch.where(kind < NOTHING, False, torch.where(kind < NOTHING + STRIPS, strips, outside))
     whole_ground, whole_objects = content < ONE_CONTENT, content > 1 - ONE_CONTENT
-    ground, objects = known | whole_ground[:, :, None], known | whole_objects[:, :, None]
+    direction = torch.pi * line[:, 1]
+    axis = (cell + 0.5) / size - 0.5
+    distance = axis[:, None] * direction.cos()[:, None, None] + axis * direction.sin()[:, None, None]
+    low_cells, high_cells = BAND_CELLS  # A number below BAND determines the width of the band.
+    width_cells = low_cells + (high_cells - low_cells) * line[:, 0] / BAND
+    is_near = (distance - (line[:, 2] - 0.5)[:, None, None]).abs() * size < width_cells[:, None, None] / 2
+    band = is_near & (line[:, :1, None] < BAND)
+    ground, objects = known | band | whole_ground[:, :, None], known | whole_objects[:, :, None]
     half = channels // 2
     parts = [ground[:, None].expand(-1, half, -1, -1), objects[:, None].expand(-1, channels - half, -1, -1)]
     return 1 - torch.cat(parts, dim=1).float()
