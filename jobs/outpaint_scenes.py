@@ -58,6 +58,9 @@ class Config(RePaintOptions):
     """Blocks that are sampled as crops at any place and heading, instead of views of a vehicle: those that do not lie
     ahead of or behind the given scene (off-street), or all blocks. Only models with labels such as low-medium-free
     distinguish both (default: none for one block on each side, all over longer distances)."""
+    road_sketch: str = ""
+    """JSON file with roads that the generated blocks contain: a list of {"points_m": [[x, y], ...], "width_m": 7,
+    "sidewalk_m": 2}, in metres in the frame of the given scene, x ahead and y to the left."""
     tile_m: float | None = None
     """Side of the tiles in metres, at least 64 (default: each result is written as one scene)."""
     neighbour_latents: Literal["reencode", "copy", "paper"] | None = None

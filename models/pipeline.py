@@ -26,6 +26,7 @@ from models.composition.extend import Side, extend_scene
 from models.composition.generator import StepCallback
 from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
 from models.composition.outpaint import BlockIndex, choose_arrangement, label_blocks, outpaint_scene
+from models.composition.road_sketch import SketchedRoad
 from models.dit import DiT
 from models.execution import SamplingExecution
 from models.labels import FREE, find_label_index, split_label
@@ -440,6 +441,11 @@ class PrITTIPipeline:
     def spec(self) -> LayoutSpec:
         """Layout of the scenes."""
         return self.lvae.spec
+
+    @property
+    def has_split_latent(self) -> bool:
+        """True if the first half of the channels of a latent belongs to the ground, the second half to the objects."""
+        return self.lvae.config.split_latent
 
     @property
     def latent_shape(self) -> tuple[int, int, int]:
@@ -902,7 +908,7 @@ class PrITTIPipeline:
         indices = range(len(scenes)) if indices is None else indices
         for scene in scenes:
             self.require_grid(scene)
-        if contents != "both" and not self.lvae.config.split_latent:
+        if contents != "both" and not self.has_split_latent:
             raise ValueError(f"this model's latent mixes ground and objects, so it cannot regenerate only {contents}")
         shape = self.latent_shape
         mask = make_latent_mask(regions, shape, contents).to(self.device)
@@ -941,6 +947,7 @@ class PrITTIPipeline:
         side: Side | None = None,
         order: str | None = None,
         free_blocks: str | None = None,
+        roads: Sequence[SketchedRoad] = (),
     ) -> Scene:
         """Extend a scene by generated blocks; the input content is unchanged (paper, supplement B.3).
 
@@ -966,12 +973,14 @@ class PrITTIPipeline:
             order: "outward" or "colours"; None: see `choose_arrangement`.
             free_blocks: Blocks that count as crops at any place and heading, instead of views of a vehicle: "none",
                 "off-street" or "all"; None: see `choose_arrangement`. Ignored if `label` is a mapping.
+            roads: Roads that the generated blocks contain, in the frame of the scene; ignored with `side`.
 
         Returns:
             One scene that covers all blocks.
 
         Raises:
-            ValueError: The scene does not fit the model, or the overlap is not a whole number of cells.
+            ValueError: The scene does not fit the model, the overlap is not a whole number of cells, or a road
+                contradicts the ground of the scene.
         """
         if side is not None:
             if not isinstance(label, str):
@@ -994,6 +1003,7 @@ class PrITTIPipeline:
             repaint,
             guidance_scale,
             callback_on_step_end,
+            roads,
         )
 
     def require_grid(self, scene: Scene) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from math import ceil
 
 from rich.progress import MofNCompleteColumn, Progress
@@ -14,6 +15,7 @@ from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import make_execution, make_inpainting_config, select_scenes
 from models.composition.outpaint import HARDLY_KNOWN, Arrangement, choose_arrangement, label_blocks
+from models.composition.road_sketch import SketchedRoad
 from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
 from pipelines.runtime import storage
 
@@ -76,6 +78,22 @@ def read_labels_map(path: str, kind: str, counts: tuple[int, int, int, int]) -> 
     return tuple(tuple(row) for row in rows)
 
 
+def read_road_sketch(path: str) -> tuple[SketchedRoad, ...]:
+    """Return the roads of a sketch.
+
+    Raises:
+        ValueError: The file does not hold roads.
+    """
+    roads = storage.read_json(make_absolute(path))
+    names = {field.name for field in fields(SketchedRoad)}
+    if not isinstance(roads, list) or not all(isinstance(road, dict) and road.keys() <= names for road in roads):
+        raise ValueError(f'--road-sketch {path}: expected a list such as [{{"points_m": [[64, 0], [200, 40]]}}]')
+    try:
+        return tuple(SketchedRoad(**road | {"points_m": tuple(map(tuple, road["points_m"]))}) for road in roads)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"--road-sketch {path}: {error}") from error
+
+
 def outpaint(config: Config) -> list[str]:
     """Extend scenes and write them; return the path of each scene's table with the known ground in each block."""
     counts, arrangement = arrange_blocks(config)
@@ -91,6 +109,7 @@ def outpaint(config: Config) -> list[str]:
         labels_map=read_labels_map(config.labels_map, read_label_kind(model), counts) if config.labels_map else None,
         free_blocks=arrangement.free_blocks,
         tile_m=config.tile_m,
+        roads=read_road_sketch(config.road_sketch) if config.road_sketch else (),
         seed=config.seed,
         overlap=arrangement.overlap,
         mode=config.neighbour_latents,

@@ -33,6 +33,11 @@ class SceneGenerator(Protocol):
         ...
 
     @property
+    def has_split_latent(self) -> bool:
+        """True if the first half of the channels of a latent belongs to the ground, the second half to the objects."""
+        ...
+
+    @property
     def latent_shape(self) -> tuple[int, int, int]:
         """Shape (c, h, w) of a latent."""
         ...

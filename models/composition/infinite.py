@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,10 +12,12 @@ from models.composition.outpaint import (
     BlockGrid,
     BlockIndex,
     SceneBlock,
+    check_roads,
     find_ground_height,
     generate_blocks,
     rank_four_colors,
 )
+from models.composition.road_sketch import SketchedRoad
 from models.sampling.repaint import InpaintingConfig
 from models.scene import Grid, Scene
 
@@ -38,9 +40,11 @@ class InfiniteScene:
         scene_index: Index of the scene. With the same scene, seed, index and labels, each block equals that of
             `PrITTIPipeline.outpaint` in the order "colours", up to rounding. Blocks at the border of the latter are
             equal if its numbers of blocks are even.
+        roads: Sketched roads, in the frame of block (0, 0); they need the mode "reencode" and split latents.
 
     Raises:
-        ValueError: The label is unknown to the model, or the overlap is 0.5 or more.
+        ValueError: The label is unknown to the model, or the overlap is 0.5 or more, or the model cannot
+            follow the roads.
     """
 
     def __init__(
@@ -54,14 +58,17 @@ class InfiniteScene:
         guidance_scale: float = 1.0,
         scene: Scene | None = None,
         scene_index: int = 0,
+        roads: Sequence[SketchedRoad] = (),
     ) -> None:
         self.model, self.label, self.seed, self.scene_index = model, label, seed, scene_index
         self.options: dict[str, Any] = {"mode": mode, "repaint": repaint, "guidance_scale": guidance_scale}
         block_grid = BlockGrid.from_overlap(model.latent_shape[-1], overlap, rank=rank_four_colors, num_blocks=None)
-        self.composer = BlockComposer(block_grid, model.spec, model.encode)
+        self.composer = BlockComposer(block_grid, model.spec, model.encode, roads=roads)
         self.blocks: dict[BlockIndex, SceneBlock] = {}
         self.scene = scene
         model.label_tensor([self.label_of((0, 0))])
+        given = scene or model.new_identity("city", seed, 0, self.label_of((0, 0)))
+        check_roads(roads, given, mode, model.has_split_latent)
 
     def label_of(self, index: BlockIndex) -> str:
         """Return the label of a block.

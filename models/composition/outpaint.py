@@ -22,6 +22,8 @@ import torch
 from torch import Tensor
 
 from models.composition.generator import SceneGenerator, StepCallback
+from models.composition.inpaint import find_region_cells
+from models.composition.road_sketch import SketchedRoad, add_sketched_ground, check_sketch
 from models.composition.seam_blending import extract_new_part, extrapolate_ground
 from models.labels import mark_free, require_labels
 from models.layout import LayoutSpec
@@ -306,7 +308,7 @@ class BlockCondition:
     @cached_property
     def new_pixels(self) -> np.ndarray:
         """(rows, cols) bool mask of the pixels to generate."""
-        return self.known.grid.upsample_cells(self.mask[0].cpu().numpy() > 0)
+        return self.known.grid.upsample_cells(self.mask[-1].cpu().numpy() > 0)  # Sketched ground is new, too.
 
 
 @dataclass(frozen=True)
@@ -374,10 +376,19 @@ class BlockComposer:
         spec: Layout of one block.
         encode: Function that encodes scenes to latents.
         level_m: Ground height at the origin of a block's frame in the training data (metres).
+        roads: Sketched roads, whose ground all blocks know; the latents of the model must be split.
     """
 
-    def __init__(self, block_grid: BlockGrid, spec: LayoutSpec, encode: EncodeScenes, level_m: float = 0.0) -> None:
+    def __init__(
+        self,
+        block_grid: BlockGrid,
+        spec: LayoutSpec,
+        encode: EncodeScenes,
+        level_m: float = 0.0,
+        roads: Sequence[SketchedRoad] = (),
+    ) -> None:
         self.block_grid, self.spec, self.encode, self.level_m = block_grid, spec, encode, level_m
+        self.roads = roads
 
     @property
     def step_px(self) -> int:
@@ -499,16 +510,24 @@ class BlockComposer:
         mask = torch.from_numpy(owned)
         datum_m = find_ground_height(known, 0.0, 0.0) - self.level_m if parts and mode == "reencode" else 0.0
         known = known.translate(0, 0, -datum_m)
-        latent = self.encode([extrapolate_ground(known, grid.upsample_cells(owned))])[0]
+        new = grid.upsample_cells(owned)
+        shown, offset_m = extrapolate_ground(known, new), (index[0] * self.step_m, index[1] * self.step_m)
+        shown, drawn = add_sketched_ground(shown, self.roads, new, offset_m, self.level_m)
+        latent = self.encode([shown])[0]
         if mode != "reencode":
             latent = torch.zeros_like(latent)
             for other, block, cells in parts:
                 there, here = self.block_grid.overlap_cells(other, index), self.block_grid.overlap_cells(index, other)
                 shared = torch.from_numpy(cells[here]).to(latent.device)
                 latent[:, *here] = torch.where(shared, block.latent[:, *there].to(latent), latent[:, *here])
-        seen = np.any(known.occupied, axis=0)[~grid.upsample_cells(owned)]
+        seen = (np.any(known.occupied, axis=0) | drawn)[~new | drawn]
         known_ground = float(seen.mean()) if len(seen) else 1.0
-        return BlockCondition(known, latent, mask.to(latent).expand_as(latent), datum_m, known_ground)
+        mask = mask.to(latent).expand_as(latent)
+        if drawn.any():  # The first half of the channels belongs to the ground.
+            sketched = ~find_region_cells(~drawn, len(owned))
+            mask = mask.clone()
+            mask[: len(mask) // 2, torch.from_numpy(sketched)] = 0.0
+        return BlockCondition(known, latent, mask, datum_m, known_ground)
 
     def finish_block(
         self, condition: BlockCondition, latent: Tensor, generated: Scene, blend: bool = True
@@ -553,6 +572,28 @@ class BlockComposer:
         classes = self.spec.ground_classes
         primitives = concatenate_primitives(objects)
         return replace(like, grid=grid, height_m=height, occupied=occupied, ground_classes=classes, **primitives)
+
+
+def check_roads(roads: Sequence[SketchedRoad], scene: Scene, mode: str, has_split_latent: bool) -> None:
+    """Check that outpainting can follow sketched roads.
+
+    Args:
+        roads: Roads in the frame of the scene.
+        scene: Scene to extend.
+        mode: One of MODES.
+        has_split_latent: Whether separate channels of the latents hold the ground.
+
+    Raises:
+        ValueError: The mode is not "reencode", the latents are not split, or a road contradicts the ground of the scene
+            (`check_sketch`).
+    """
+    if not roads:
+        return
+    if mode != "reencode":
+        raise ValueError(f"sketched roads need the mode reencode, not {mode}, because they are encoded")
+    if not has_split_latent:
+        raise ValueError("the latents of this model mix ground and objects, so it cannot follow sketched roads")
+    check_sketch(roads, scene)
 
 
 def label_blocks(
@@ -682,6 +723,7 @@ def outpaint_scene(
     repaint: InpaintingConfig | None,
     guidance_scale: float,
     callback_on_step_end: StepCallback | None,
+    roads: Sequence[SketchedRoad] = (),
 ) -> Scene:
     """Extend a scene on the model's grid by generated blocks on its four sides.
 
@@ -697,17 +739,19 @@ def outpaint_scene(
         repaint: Options of inpainting; None: see `resolve_inpainting`.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
+        roads: Sketched roads in the frame of the scene (`check_roads`).
 
     Returns:
         One scene that covers all blocks.
 
     Raises:
-        ValueError: The overlap is not a whole number of cells, or `mode` is unknown.
+        ValueError: The overlap is not a whole number of cells, `mode` is unknown, or the model cannot follow the roads.
     """
+    check_roads(roads, scene, mode, model.has_split_latent)
     block_grid = BlockGrid.from_overlap(
         model.latent_shape[-1], arrangement.overlap, rank=RANKS[arrangement.order], num_blocks=num_blocks
     )
-    composer = BlockComposer(block_grid, model.spec, model.encode, find_ground_height(scene, 0.0, 0.0))
+    composer = BlockComposer(block_grid, model.spec, model.encode, find_ground_height(scene, 0.0, 0.0), roads)
     blocks = {(0, 0): SceneBlock(scene, model.encode([scene])[0])}
     for group in block_grid.group_by_rank(index for index in block_grid.indices() if index not in blocks):
         blocks |= generate_blocks(

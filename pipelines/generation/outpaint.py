@@ -21,10 +21,12 @@ from models.composition.outpaint import (
     BlockIndex,
     SceneBlock,
     Tile,
+    check_roads,
     find_ground_height,
     generate_blocks,
     label_blocks,
 )
+from models.composition.road_sketch import SketchedRoad
 from models.execution import SamplingExecution
 from models.sampling.repaint import InpaintingConfig
 from models.scene import UNSET, Scene
@@ -58,6 +60,7 @@ class OutpaintRequest(Request):
         free_blocks: Blocks that count as crops at any place and heading (`label_blocks`).
         tile_m: Side (m) of the tiles in which a scene is written. No step holds a whole scene in memory. None: each
             scene is written as a whole.
+        roads: Sketched roads in the frame of each scene, which its blocks contain.
         seed: Seed of the noise.
         overlap: Overlap of neighbouring blocks as a fraction of a block.
         mode: Outpainting mode of `generate_blocks`. None: the mode that the pipeline stores.
@@ -84,6 +87,7 @@ class OutpaintRequest(Request):
     labels_map: tuple[tuple[str, ...], ...] | None = None
     free_blocks: str = "none"
     tile_m: float | None = None
+    roads: tuple[SketchedRoad, ...] = ()
 
     def scene_id(self, number: int) -> str:
         """Return the id of an extended scene.
@@ -277,7 +281,11 @@ class Outpainter:
         blocks = {index: read_block(make_block_path(directory, index), empty) for index in indices}
         blocks[(0, 0)] = SceneBlock(given, self.pipeline.encode([given])[0])
         composer = BlockComposer(
-            self.block_grid, self.pipeline.spec, self.pipeline.encode, find_ground_height(given, 0.0, 0.0)
+            self.block_grid,
+            self.pipeline.spec,
+            self.pipeline.encode,
+            find_ground_height(given, 0.0, 0.0),
+            self.request.roads,
         )
         return composer, given, blocks
 
@@ -431,6 +439,9 @@ def outpaint_scenes(
     parts = [storage.join_uri(request.output, "blocks", request.run)]
     guard_generation_run(request, pipeline, parts, input=asdict(selection), scenes=selection.files())
 
+    for shard, row in chosen if request.roads else []:
+        scene = resample_to_model_grid(shard.scenes([row])[0], pipeline.spec)
+        check_roads(request.roads, scene, str(request.mode), pipeline.has_split_latent)
     tiles = BlockComposer(block_grid, pipeline.spec, pipeline.encode).cut_tiles(request.tile_m)
     promised = {request.shard(number): 1 for number in range(len(chosen) * len(tiles))}
     files = set(storage.list_files(parts[0], ".safetensors"))

@@ -298,7 +298,7 @@ def test_outpaint_keeps_given_scene_and_takes_label_per_block(pipeline):
     scene = random_scene(2, n=30, grid=SPEC.grid)
     for mode, last in (("copy", (1, 1, 1, 1)), ("reencode", (1, 0, 0, 2))):
         labels = {index: "high" if index[0] else "low" for index in product(range(-1, 2), range(-2, 2))}
-        large = pipeline.outpaint(scene, labels, mode=mode, num_blocks=last, repaint=QUICK)
+        large = pipeline.outpaint(scene, labels, mode=mode, num_blocks=last, repaint=QUICK, order="outward")
         steps = last[0] + last[1], last[2] + last[3]
         assert (large.grid.rows, large.grid.cols) == tuple(32 + 16 * n for n in steps)
         middle = large.crop(scene.grid)

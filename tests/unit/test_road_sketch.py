@@ -1,0 +1,108 @@
+"""Tests of sketched roads: geometry, given ground, and the known part of blocks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers import random_scene, small_spec, tiny_pipeline
+
+from models.composition.outpaint import BlockComposer, BlockGrid, SceneBlock, check_roads
+from models.composition.road_sketch import SketchedRoad, add_sketched_ground, check_sketch, draw_roads
+from models.layout import LayoutSpec
+from models.scene import KITTI_GROUND_CLASSES, Grid
+from models.tensors import make_empty_scene
+
+FINE = Grid(rows=256, cols=256, resolution_m=0.25)
+SMALL = Grid(rows=32, cols=32, resolution_m=2.0)
+ROAD, SIDEWALK = (KITTI_GROUND_CLASSES.index(name) for name in ("road", "sidewalk"))
+
+
+def make_street(grid: Grid):
+    """Return a scene with a road along y = 0 on terrain, without objects."""
+    scene = random_scene(0, n=0, grid=grid)
+    road = np.abs(grid.y_m())[None, :] < 4
+    occupied = np.zeros_like(scene.occupied)
+    occupied[ROAD] = road
+    occupied[KITTI_GROUND_CLASSES.index("terrain")] = ~road
+    return replace(scene, occupied=occupied, height_m=np.where(occupied, 1.5, 0).astype(np.float32))
+
+
+def test_drawn_roads_have_the_area_of_their_shape():
+    bend = SketchedRoad(((-20.0, 0.0), (32.0, 0.0), (32.0, 80.0)), width_m=8.0, sidewalk_m=2.0)
+    road, sidewalk = draw_roads([bend], FINE)
+    pixel_m2 = FINE.resolution_m**2
+    # Inside of the grid: 32 m ahead and 32 m to the left, and a quarter of a disc around the bend.
+    assert road.sum() * pixel_m2 == pytest.approx(2 * 32 * 8 - 4 * 4 + np.pi * 16 / 4, rel=0.02)
+    assert not (road & sidewalk).any()
+    assert sidewalk[FINE.pixel(np.array([16.0]), np.array([5.0]))].all()
+    assert not draw_roads([bend], replace(FINE, front_m=-64.0))[0].any()
+
+
+def test_distance_to_a_centreline_agrees_with_shapely():
+    shapely = pytest.importorskip("shapely")
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-50, 50, (6, 2))
+    x, y = rng.uniform(-80, 80, (2, 200))
+    truth = shapely.distance(shapely.LineString(points), shapely.points(x, y))
+    assert np.allclose(SketchedRoad(tuple(map(tuple, points))).measure_distance(x, y), truth)
+
+
+def test_wrong_roads_are_refused():
+    for points in ([(0.0, 0.0)], [(0.0, 0.0), (float("nan"), 1.0)]):
+        with pytest.raises(ValueError, match="expected two or more points"):
+            SketchedRoad(tuple(points))
+    with pytest.raises(ValueError, match=r"width_m is 0\.5"):
+        SketchedRoad(((0.0, 0.0), (9.0, 0.0)), width_m=0.5)
+
+
+def test_sketch_must_not_contradict_given_ground():
+    street = make_street(SMALL)
+    check_sketch([SketchedRoad(((40.0, 0.0), (200.0, 0.0)))], street)  # It continues the street.
+    check_sketch([SketchedRoad(((-80.0, 50.0), (200.0, 50.0)))], street)  # It does not touch the scene.
+    with pytest.raises(ValueError, match=r"road 2 of the sketch runs over terrain of scene test-0000 at \(40"):
+        check_sketch([SketchedRoad(((64.0, 0.0), (90.0, 0.0))), SketchedRoad(((40.0, 20.0), (90.0, 20.0)))], street)
+
+
+def test_sketched_ground_takes_the_height_of_its_surroundings():
+    street = make_street(SMALL)
+    road = SketchedRoad(((100.0, -32.0), (100.0, 32.0)))  # It crosses the scene, which is shifted by 64 m.
+    made, drawn = add_sketched_ground(street, [road], np.ones((32, 32), bool), (64.0, 0.0), 9.0)
+    assert drawn.any() and (made.occupied.sum(axis=0) == 1).all()
+    assert np.allclose(made.height_m[made.occupied], 1.5) and not made.height_m[~made.occupied].any()
+    assert (made.occupied[SIDEWALK] == (drawn & ~made.occupied[ROAD])).all() and made.occupied[SIDEWALK].any()
+    assert not (made.occupied != street.occupied)[:, ~drawn].any()
+    bare = make_empty_scene("a", "town", "0", 0, LayoutSpec(grid=SMALL))
+    made, drawn = add_sketched_ground(bare, [road], np.ones((32, 32), bool), (64.0, 0.0), 9.0)
+    assert (made.occupied.sum(axis=0) == 1).all() and np.allclose(made.height_m[made.occupied], 9.0)
+
+
+def test_blocks_know_the_ground_of_sketched_roads():
+    seen = []
+
+    def encode(scenes):
+        seen.extend(scenes)
+        return torch.zeros(len(scenes), 4, 8, 8)
+
+    road = SketchedRoad(((40.0, 0.0), (300.0, 0.0)), width_m=20.0)
+    composer = BlockComposer(BlockGrid(8, 6, num_blocks=None), LayoutSpec(grid=SMALL), encode, 1.5, [road])
+    street = make_street(SMALL)
+    blocks = {(0, 0): SceneBlock(street, torch.zeros(4, 8, 8))}
+    empty = make_empty_scene("a", "town", "0", 0, LayoutSpec(grid=SMALL))
+    condition = composer.condition_block((1, 0), blocks, empty, "reencode")
+    ground, objects = condition.mask[0] == 0, condition.mask[-1] == 0
+    # The block starts at x = 48 m. Its rear quarter is known; ahead of it, the sketch covers 24 of 64 m in width.
+    assert objects[6:].all() and not objects[:6].any()
+    assert ground[:6, 3:5].all() and not ground[:6, :2].any() and not ground[:6, 6:].any()
+    assert condition.new_pixels[:24].all() and not condition.new_pixels[24:].any() and condition.known_ground == 1
+    assert seen[-1].occupied[ROAD][:, 16].all()
+
+
+def test_roads_need_a_model_that_can_follow_them():
+    pipeline = tiny_pipeline(small_spec())
+    street, road = make_street(pipeline.spec.grid), SketchedRoad(((64.0, 0.0), (99.0, 0.0)))
+    check_roads([], street, "copy", False)
+    with pytest.raises(ValueError, match="need the mode reencode, not copy"):
+        check_roads([road], street, "copy", True)
+    with pytest.raises(ValueError, match="mix ground and objects"):
+        check_roads([road], street, "reencode", False)
