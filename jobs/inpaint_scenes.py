@@ -5,7 +5,7 @@
     jobs/inpaint_scenes.py --half-plane 1 0 32 --num-variants 4          everything at least 32 m ahead, four variants
     jobs/inpaint_scenes.py --primitives 3 17 --contents objects          objects around primitives 3 and 17, same ground
     jobs/inpaint_scenes.py --half-plane 1 0 -99 --contents objects       new objects on the same ground
-    jobs/inpaint_scenes.py --polygon-m ... --guided                      fast, with smoother seams
+    jobs/inpaint_scenes.py --polygon-m ... --inpainting repaint          as in the paper, slowly
 
 Regions are enlarged to whole latent cells. The job writes scene tables with source=generated-<run>, one GLB file per
 scene, and <run>.html.

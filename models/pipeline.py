@@ -669,14 +669,16 @@ class PrITTIPipeline:
             repaint: Options; None: the default.
 
         Returns:
-            The options with a number of steps. By default, an inpainting network uses the sampler of the pipeline; the
-            others use RePaint with the options of the paper.
+            The options with a number of steps. By default, an inpainting network uses the sampler of the pipeline.
+            Pipelines of the paper's presets use RePaint as in the paper, the others `RePaintConfig.guided()`.
 
         Raises:
             ValueError: The network cannot read a known part.
         """
-        if repaint is None:
-            repaint = TrainedInpainting() if self.dit.config.inpainting else RePaintConfig()
+        if repaint is None and self.dit.config.inpainting:
+            repaint = TrainedInpainting()
+        elif repaint is None:
+            repaint = RePaintConfig() if self.config.neighbour_latents == "paper" else RePaintConfig.guided()
         if isinstance(repaint, RePaintConfig):
             return repaint
         if not self.dit.config.inpainting:

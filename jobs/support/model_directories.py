@@ -41,6 +41,11 @@ def is_inpainting_model(model: str) -> bool:
     return storage.read_json(storage.join_uri(model, "dit/config.json")).get("inpainting", False) is True
 
 
+def uses_paper_outpainting(model: str) -> bool:
+    """Return whether the pipeline in a directory inpaints and outpaints as in the paper by default."""
+    return storage.read_json(storage.join_uri(model, INDEX_NAME)).get("neighbour_latents") == "paper"
+
+
 def find_pipeline_directory(model: str) -> str:
     """Return the directory of the pipeline that --model names; a pipeline in MLflow is downloaded first.
 

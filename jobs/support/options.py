@@ -101,8 +101,8 @@ class RePaintOptions(GenerationOptions):
     inpainting: Literal["trained", "guided", "repaint"] | None = None
     """How the model continues known parts. trained: the network reads them, with the sampler that the model stores.
     repaint: RePaint with the options of the paper (Sec. 3.3 and supplement B.3). guided: 50 steps with pseudoinverse
-    guidance, eta 0.3 and no resampling (default: trained for models of train_dit.py --inpainting, such as the released
-    weights, else repaint)."""
+    guidance, eta 0.3 and no resampling (default: trained for models of train_dit.py --inpainting, repaint for the
+    paper's presets, else guided)."""
     num_inference_steps: int | None = None
     """Number of denoising steps, without the repetitions of RePaint (default: as the model stores with trained, 250 as
     in the paper with repaint, 50 with guided)."""

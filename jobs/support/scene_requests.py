@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from jobs.support.cli import resolve_path
-from jobs.support.model_directories import is_inpainting_model
+from jobs.support.model_directories import is_inpainting_model, uses_paper_outpainting
 from jobs.support.options import RePaintOptions, SceneOptions
 from models.execution import SamplingExecution
 from models.sampling.repaint import InpaintingConfig, RePaintConfig, TrainedInpainting
@@ -35,7 +35,7 @@ def make_inpainting_config(options: RePaintOptions, model: str) -> InpaintingCon
             f"--inpainting trained: {model} is no inpainting model; use guided or repaint, or train it with "
             "jobs/train_dit.py --inpainting"
         )
-    way = options.inpainting or ("trained" if able else "repaint")
+    way = options.inpainting or ("trained" if able else "repaint" if uses_paper_outpainting(model) else "guided")
     of_repaint = {
         "jump_length": options.jump_length,
         "resamplings": options.num_resamplings,

@@ -132,6 +132,8 @@ def test_empty_known_part_is_ordinary_sampling(pipeline):
 
 def test_default_of_inpainting_depends_on_the_model(pipeline):
     plain = tiny_pipeline(small_spec())
+    assert plain.resolve_inpainting(None) == RePaintConfig.guided()
+    plain.register_to_config(neighbour_latents="paper")
     assert plain.resolve_inpainting(None) == RePaintConfig() and plain.resolve_inpainting(QUICK) == QUICK
     assert pipeline.resolve_inpainting(None) == TrainedInpainting(pipeline.config.num_inference_steps)
     assert pipeline.resolve_inpainting(TrainedInpainting(7)).num_evaluations == 7
