@@ -46,8 +46,8 @@ encode_latents --dataset @/datasets/town --lvae @/models/small-lvae
 train_dit smoke --dataset @/datasets/town --name small --steps 24 --num-workers 2
 sample_scenes --model @/models/pritti-small --num-scenes 24 --num-inference-steps 4 --run small --output @/small
 sample_scenes --model town --num-scenes 24 --sampler dpm++ --num-inference-steps 10 --run town --output @/town
-outpaint_scenes --model town --input @/town --inpainting guided --num-inference-steps 8 --extent-m 192 192
-inpaint_scenes --model town --input @/town --half-plane 1 0 32 --inpainting guided --num-inference-steps 20 --output @/inpainted
+outpaint_scenes --model town --input @/town --num-inference-steps 8 --extent-m 192 192
+inpaint_scenes --model town --input @/town --half-plane 1 0 32 --num-inference-steps 20 --output @/inpainted
 edit_scenes remove --category pole --input @/town --output @/edited
 evaluate_scenes --real @/datasets/town --generated @/town --run town --lvae @/models/small-lvae --lite0 False
 evaluate_seams --generated @/outpainted
