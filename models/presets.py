@@ -168,7 +168,7 @@ class DiTPreset:
 
 
 SMALL_DIT = DiTConfig(2, 6, 256, 4, prediction="v_prediction")
-TOWN_DIT = DiTConfig(2, 8, 288, 6, prediction="v_prediction")
+TOWN_DIT = DiTConfig(2, 8, 288, 6, prediction="v_prediction", inpainting=True)
 PAPER_DECODING: dict[str, Any] = {"neighbour_latents": "paper", "attach": False}
 QUICK_DIT: dict[str, Any] = {"normalise_latents": True, "learning_rate": 1e-3, "ema_decay": 0.999}
 

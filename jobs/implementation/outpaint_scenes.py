@@ -33,7 +33,7 @@ def arrange_blocks(config: Config) -> tuple[tuple[int, int, int, int], Arrangeme
         counts = config.blocks_ahead, config.blocks_behind, config.blocks_left, config.blocks_right
     else:
         is_far = max(config.extent_m) > 2 * BLOCK_M  # The paper's blocks on each side add half a block.
-        overlap = choose_arrangement((1 + is_far,) * 4, *chosen).overlap
+        overlap = choose_arrangement((2 if is_far else 1, 0, 0, 0), *chosen).overlap
         step_m = BLOCK_M * (1 - overlap)
         if not 0 < step_m <= BLOCK_M or min(config.extent_m) < BLOCK_M:
             raise ValueError(
