@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers import ROOT
 
-from jobs.outpaint_scenes import Config as OutpaintConfig
+from models.composition.outpaint import choose_arrangement
 from models.dit import DiT
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
@@ -34,11 +34,11 @@ def count_parameters(model: LayoutVAE) -> float:
 def list_names() -> dict[str, Any]:
     names: dict[str, Any] = {"lvae": LVAE_PRESETS["kitti360"], "dit": DIT_PRESETS["kitti360"]}
     names |= {"dit_l": DIT_PRESETS["kitti360-l"], "dit_xl": DIT_PRESETS["kitti360-xl"]}
-    names |= {function.__name__: function for function in (make_lvae, count_parameters, len, tuple)}
+    names |= {function.__name__: function for function in (make_lvae, count_parameters, choose_arrangement, len, tuple)}
     for module in set(re.findall(r"\b((?:jobs|models|pipelines)(?:\.[a-z_]+)+)\.[A-Z]", str(ROWS))):
         importlib.import_module(module)
     packages = {name: importlib.import_module(name) for name in ("jobs", "models", "pipelines")}
-    return names | {"OutpaintConfig": OutpaintConfig} | packages
+    return names | packages
 
 
 def test_page_lists_the_paper():

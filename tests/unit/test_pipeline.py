@@ -32,7 +32,7 @@ from models.sampling.diffusion import (
     sample_with_scheduler,
     scale_noise,
 )
-from models.sampling.repaint import RePaintConfig
+from models.sampling.repaint import RePaintConfig, TrainedInpainting
 from models.sampling.schedulers import SAMPLERS, SchedulerConfig, list_schedule_options
 from models.scene import Grid
 from models.training import make_diffusion_loss
@@ -453,4 +453,6 @@ def test_studio_uses_eta_of_guided_options():
     from pipelines.studio.requests import RepaintRequest
 
     guided = RePaintConfig.guided(20)
-    assert RepaintRequest().repaint() == replace(guided, jump_length=1)
+    assert RepaintRequest().repaint(trained=False) == replace(guided, jump_length=1)
+    assert RepaintRequest().repaint(trained=True) == TrainedInpainting(20)
+    assert RepaintRequest(eta=0.5).repaint(trained=True) == replace(guided, jump_length=1, eta=0.5)
