@@ -53,7 +53,13 @@ from models.sampling.diffusion import (
     with_guidance,
     with_known,
 )
-from models.sampling.repaint import NUM_INFERENCE_STEPS, InpaintingConfig, RePaintConfig, TrainedInpainting
+from models.sampling.repaint import (
+    NUM_INFERENCE_STEPS,
+    InpaintingConfig,
+    RePaintConfig,
+    TrainedInpainting,
+    choose_inpainting,
+)
 from models.sampling.schedulers import SAMPLERS, SchedulerConfig
 from models.scene import Scene
 from models.tensors import EXISTENCE_THRESHOLD, make_empty_scene, make_layout_batch
@@ -675,14 +681,12 @@ class PrITTIPipeline:
         Raises:
             ValueError: The network cannot read a known part.
         """
-        if repaint is None and self.dit.config.inpainting:
-            repaint = TrainedInpainting()
-        elif repaint is None:
-            repaint = RePaintConfig() if self.config.neighbour_latents == "paper" else RePaintConfig.guided()
+        if not isinstance(repaint, RePaintConfig):
+            way, is_of_paper = repaint and "trained", self.config.neighbour_latents == "paper"
+            chosen = choose_inpainting(way, self.dit.config.inpainting, is_of_paper)
+            repaint = repaint or chosen
         if isinstance(repaint, RePaintConfig):
             return repaint
-        if not self.dit.config.inpainting:
-            raise ValueError("this model is no inpainting model; use RePaintConfig, or train it with --inpainting")
         return TrainedInpainting(repaint.num_inference_steps or self.config.num_inference_steps)
 
     @contextmanager

@@ -8,7 +8,7 @@ from jobs.support.cli import resolve_path
 from jobs.support.model_directories import is_inpainting_model, uses_paper_outpainting
 from jobs.support.options import RePaintOptions, SceneOptions
 from models.execution import SamplingExecution
-from models.sampling.repaint import InpaintingConfig, RePaintConfig, TrainedInpainting
+from models.sampling.repaint import InpaintingConfig, TrainedInpainting, choose_inpainting
 from pipelines.schema.scene_subset import SceneSubset
 
 
@@ -29,13 +29,10 @@ def make_inpainting_config(options: RePaintOptions, model: str) -> InpaintingCon
     Raises:
         ValueError: The model is no inpainting model, or an option has no effect.
     """
-    able = is_inpainting_model(model)
-    if options.inpainting == "trained" and not able:
-        raise ValueError(
-            f"--inpainting trained: {model} is no inpainting model; use guided or repaint, or train it with "
-            "jobs/train_dit.py --inpainting"
-        )
-    way = options.inpainting or ("trained" if able else "repaint" if uses_paper_outpainting(model) else "guided")
+    try:
+        start = choose_inpainting(options.inpainting, is_inpainting_model(model), uses_paper_outpainting(model))
+    except ValueError as error:
+        raise ValueError(f"--inpainting {options.inpainting}, --model {model}: {error}") from error
     of_repaint = {
         "jump_length": options.jump_length,
         "resamplings": options.num_resamplings,
@@ -43,11 +40,11 @@ def make_inpainting_config(options: RePaintOptions, model: str) -> InpaintingCon
         "eta": options.eta,
     }
     given = {name: value for name, value in of_repaint.items() if value is not None}
-    if way == "trained":
+    if isinstance(start, TrainedInpainting):
         if given:
             names = ", ".join("--" + name.replace("resamplings", "num_resamplings").replace("_", "-") for name in given)
             raise ValueError(f"{names} has no effect with --inpainting trained; add --inpainting repaint or guided")
         return TrainedInpainting(options.num_inference_steps)
     if options.num_inference_steps is not None:
         given["num_inference_steps"] = options.num_inference_steps
-    return replace(RePaintConfig.guided() if way == "guided" else RePaintConfig(), **given)
+    return replace(start, **given)

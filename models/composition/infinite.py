@@ -43,8 +43,7 @@ class InfiniteScene:
         roads: Sketched roads, in the frame of block (0, 0); they need the mode "reencode" and split latents.
 
     Raises:
-        ValueError: The label is unknown to the model, or the overlap is 0.5 or more, or the model cannot
-            follow the roads.
+        ValueError: The label is unknown to the model, the overlap is 0.5 or more, or the model cannot follow the roads.
     """
 
     def __init__(

@@ -121,3 +121,29 @@ class RePaintConfig:
 
 
 InpaintingConfig = RePaintConfig | TrainedInpainting
+
+
+def choose_inpainting(way: str | None, reads_known: bool, is_of_paper: bool) -> InpaintingConfig:
+    """Return options of inpainting and outpainting by name.
+
+    Args:
+        way: "trained", "guided" or "repaint". None: "trained" for a network that reads the known part, "repaint" for
+            models of the paper's presets, and "guided" for the others.
+        reads_known: Whether the network reads the known part.
+        is_of_paper: Whether the model belongs to the paper's presets.
+
+    Returns:
+        The options.
+
+    Raises:
+        ValueError: The network cannot read a known part, or the name is unknown.
+    """
+    way = way or ("trained" if reads_known else "repaint" if is_of_paper else "guided")
+    if way == "trained" and not reads_known:
+        raise ValueError(
+            "this model is no inpainting model; use guided or repaint, or train it with train_dit.py --inpainting"
+        )
+    configs = {"trained": TrainedInpainting(), "guided": RePaintConfig.guided(), "repaint": RePaintConfig()}
+    if way not in configs:
+        raise ValueError(f"inpainting is {way!r}, expected one of: {', '.join(configs)}")
+    return configs[way]
