@@ -66,6 +66,9 @@ class Config:
     inpainting: bool | None = None
     """Train the network to continue random known parts of a scene, which makes inpainting and outpainting better and
     faster (default: as in the preset; paper: False)."""
+    crop_repeats: int = 1
+    """Number of times that each crop at any place is used per epoch; each view of a vehicle is used once. Far blocks of
+    large scenes are such crops."""
     normalise_latents: bool | None = None
     """Normalise each latent channel to mean 0 and standard deviation 1 (default: as in the preset; paper: False)."""
     sample_posterior: bool | None = None

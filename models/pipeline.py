@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ from models.sampling.constraints import ConstraintConfig, ConstraintGuidance
 from models.sampling.diffusion import (
     GENERATE,
     INPAINT,
+    MAX_GUIDANCE_SCALE,
     Denoiser,
     Diffusion,
     InpaintCondition,
@@ -68,7 +70,6 @@ COMPONENTS = {"lvae": LayoutVAE, "dit": DiT}
 NEIGHBOUR_LATENTS = ("reencode", "copy", "paper")
 SCHEDULER_CONFIG = "scheduler/scheduler_config.json"
 MAX_PAG_SCALE = 20.0
-MAX_GUIDANCE_SCALE = 100.0
 PAG_START = 0.2  # Lowest timestep with perturbed-attention guidance, as a share of the number of timesteps.
 INDEX_RULES: dict[str, Rule] = {
     **dict.fromkeys((*COMPONENTS, "scheduler"), Sequential(Text(), 2, 2)),
@@ -687,7 +688,7 @@ class PrITTIPipeline:
             repaint = repaint or chosen
         if isinstance(repaint, RePaintConfig):
             return repaint
-        return TrainedInpainting(repaint.num_inference_steps or self.config.num_inference_steps)
+        return replace(repaint, num_inference_steps=repaint.num_inference_steps or self.config.num_inference_steps)
 
     @contextmanager
     def _step_callback(self, num_evaluations: int, callback: StepCallback | None) -> Iterator[OnStep]:
@@ -714,6 +715,7 @@ class PrITTIPipeline:
         noise_scaling: float | None = None,
         purpose: int = GENERATE,
         condition: InpaintCondition | None = None,
+        known_guidance_scale: float = 1.0,
     ) -> Float[Tensor, "b c h w"]:
         """Sample latents. Each latent depends only on the seed, its index, its label and its condition.
 
@@ -727,6 +729,7 @@ class PrITTIPipeline:
             noise_scaling: Divisor of the predicted noise; None: the default of the pipeline.
             purpose: Purpose of the noise: GENERATE, OUTPAINT or INPAINT (models/sampling/diffusion.py).
             condition: Known part of the latents, which an inpainting network continues.
+            known_guidance_scale: Scale of guidance by the known part; 1 switches this guidance off.
 
         Returns:
             Latents.
@@ -741,7 +744,7 @@ class PrITTIPipeline:
         timesteps = self._select_timesteps(steps)
         model = scale_noise(self.make_denoiser(timesteps, label, guidance_scale), noise_scaling)
         if condition is not None:
-            model = with_known(model, condition, self.diffusion)
+            model = with_known(model, condition, self.diffusion, known_guidance_scale)
         with (
             self._step_callback(steps, callback_on_step_end) as on_step,
             self._guide(model, timesteps, condition) as guided,
@@ -847,9 +850,16 @@ class PrITTIPipeline:
         """
         repaint = self.resolve_inpainting(repaint)
         if isinstance(repaint, TrainedInpainting):
-            steps = repaint.num_inference_steps
             return self.sample_latents(
-                labels, seed, indices, steps, guidance_scale, callback_on_step_end, None, purpose, condition
+                labels,
+                seed,
+                indices,
+                repaint.num_inference_steps,
+                guidance_scale,
+                callback_on_step_end,
+                purpose=purpose,
+                condition=condition,
+                known_guidance_scale=repaint.known_guidance_scale,
             )
         schedule = SamplingSchedule(self.diffusion, repaint.num_inference_steps, repaint.eta)
         noise = SceneNoise(seed, indices, self.latent_shape, self.device, purpose)

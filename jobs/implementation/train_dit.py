@@ -51,7 +51,7 @@ from pipelines.generation.sample import load_pipeline
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import Shard, find_shards
-from pipelines.training.data_loader import LABEL_COLUMNS, LatentReader, Stream, label_indices
+from pipelines.training.data_loader import LABEL_COLUMNS, LatentReader, Stream, label_indices, repeat_crops
 from pipelines.training.latents import digest_weights, load_lvae
 
 
@@ -82,14 +82,14 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
     loss_config = make_loss_config(config, row)
     shards = find_shards(root, source=dataset.source, split="train")
-    counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
+    stream = make_stream(config, shards, row.batch_size)
     check_training_labels(shards, label_kind)
     training = TrainingRun(
         name=name,
         round_weights=config.round_weights,
         storage_path=home_path("runs"),
         build=partial(build, architecture, settings, execution, row.label_dropout, start, loss_config),
-        stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
+        stream=stream,
         reader=LatentReader(latents_root, label_kind),
         settings=settings,
         identity=identity,
@@ -100,6 +100,27 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     )
     sampling = (start.sampling if start else {}) | {"neighbour_latents": row.neighbour_latents, "attach": row.attach}
     return training, partial(complete_pipeline, latents["lvae"], sampling)
+
+
+def make_stream(config: Config, shards: list[Shard], batch_size: int) -> Stream:
+    """Return the order of the training samples, with --crop-repeats.
+
+    Raises:
+        ValueError: --crop-repeats is below 1, or is above 1 although the dataset has no crops.
+    """
+    scenes = [shard.read("scenes", ["free_pose"]) for shard in shards]
+    counts = tuple(table.num_rows for table in scenes)
+    if config.crop_repeats < 1:
+        raise ValueError(f"--crop-repeats {config.crop_repeats}: use 1 or more")
+    if config.crop_repeats == 1:
+        return Stream(tuple(shards), counts, batch_size, config.seed)
+    rows = tuple(repeat_crops(table, config.crop_repeats) for table in scenes)
+    repeated = tuple(map(len, rows))
+    if repeated == counts:
+        raise ValueError(
+            f"--crop-repeats {config.crop_repeats}: the dataset has no crops at any place; omit the option"
+        )
+    return Stream(tuple(shards), repeated, batch_size, config.seed, rows)
 
 
 def check_training_labels(shards: list[Shard], kind: str) -> None:
@@ -219,6 +240,8 @@ def make_run_identity(
         identity |= {"sample_posterior": loss.sample_posterior}
     if row.model.inpainting:
         identity |= {"inpainting": True}
+    if config.crop_repeats != 1:
+        identity |= {"crop_repeats": config.crop_repeats}
     if config.round_weights:
         identity |= {"round_weights": True}
     return identity

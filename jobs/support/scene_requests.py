@@ -44,7 +44,11 @@ def make_inpainting_config(options: RePaintOptions, model: str) -> InpaintingCon
         if given:
             names = ", ".join("--" + name.replace("resamplings", "num_resamplings").replace("_", "-") for name in given)
             raise ValueError(f"{names} has no effect with --inpainting trained; add --inpainting repaint or guided")
-        return TrainedInpainting(options.num_inference_steps)
+        if options.known_guidance_scale is not None:
+            start = replace(start, known_guidance_scale=options.known_guidance_scale)
+        return replace(start, num_inference_steps=options.num_inference_steps)
+    if options.known_guidance_scale is not None:
+        raise ValueError("--known-guidance-scale has no effect without a network that reads known parts")
     if options.num_inference_steps is not None:
         given["num_inference_steps"] = options.num_inference_steps
     return replace(start, **given)

@@ -7,6 +7,7 @@ states (repaint.py).
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -22,6 +23,8 @@ from torch import Tensor
 Denoiser = Callable[[Tensor, Tensor, Tensor], Tensor]  # Maps latent, timestep (b,) and label (b,) to noise.
 SceneKey = int | tuple[int, ...]  # Index of a scene, or several integers that identify the scene.
 OnStep = Callable[[int, int, Tensor], Tensor]  # Maps step, timestep and latent to the next latent.
+MAX_GUIDANCE_SCALE = 100.0
+KNOWN_GUIDANCE_START = 0.3  # Lowest timestep with guidance by the known part, as a share of the number of timesteps.
 
 
 @dataclass(frozen=True)
@@ -363,24 +366,35 @@ def join_known(latent: Float[Tensor, "b c h w"], condition: InpaintCondition) ->
     return torch.cat([latent, known * condition.latent, known], dim=1)
 
 
-def with_known(model: Denoiser, condition: InpaintCondition, diffusion: Diffusion) -> Denoiser:
+def with_known(
+    model: Denoiser, condition: InpaintCondition, diffusion: Diffusion, known_guidance_scale: float = 1.0
+) -> Denoiser:
     """Condition an inpainting network on known parts, with any sampler.
 
     In the known part, the predicted noise is the one whose clean estimate is the known latent. Sampling therefore ends
     at the known latent.
 
+    Guidance by the known part is classifier-free guidance with the known part instead of the label. It applies to
+    timesteps from KNOWN_GUIDANCE_START on.
+
     Args:
         model: Inpainting network.
         condition: Known part of the latents.
         diffusion: Noise schedule.
+        known_guidance_scale: Scale of guidance by the known part; 1 switches this guidance off.
 
     Returns:
         A denoiser for latents without the known part.
     """
     kept = ~condition.mask.bool()
+    nothing = InpaintCondition(torch.zeros_like(condition.latent), torch.ones_like(condition.mask))
+    start = KNOWN_GUIDANCE_START * diffusion.num_timesteps if known_guidance_scale != 1.0 and kept.any() else math.inf
 
     def predict(latent: Tensor, timestep: Tensor, label: Tensor) -> Tensor:
         noise = model(join_known(latent, condition), timestep, label)
+        if timestep[0] >= start:
+            without = model(join_known(latent, nothing), timestep, label)
+            noise = without + known_guidance_scale * (noise - without)
         alpha_bar = float(diffusion.alpha_bar[int(timestep[0])])
         return torch.where(kept, (latent - alpha_bar**0.5 * condition.latent) / (1 - alpha_bar) ** 0.5, noise)
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from models.sampling.diffusion import MAX_GUIDANCE_SCALE
+
 NUM_INFERENCE_STEPS = 250  # Paper, supplement B.3.
 JUMP_LENGTH, RESAMPLINGS = 10, 10  # J and R of the paper (supplement B.3).
 
@@ -55,9 +57,22 @@ class TrainedInpainting:
 
     Attributes:
         num_inference_steps: Number of denoising steps; None: the default of the pipeline.
+        known_guidance_scale: Scale of guidance by the known part (`models.sampling.diffusion.with_known`); 1 switches
+            this guidance off.
+
+    Raises:
+        ValueError: The guidance scale is out of range.
     """
 
     num_inference_steps: int | None = None
+    known_guidance_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.known_guidance_scale <= MAX_GUIDANCE_SCALE:
+            raise ValueError(
+                f"known_guidance_scale is {self.known_guidance_scale}, expected 0 to {MAX_GUIDANCE_SCALE:g}; 1 switches"
+                " the guidance off"
+            )
 
     @property
     def num_evaluations(self) -> int:

@@ -154,6 +154,8 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
     defaults |= {"labels_map": None, "free_blocks": "none", "tile_m": None, "roads": ()}
     options = {name: value for name, value in options.items() if name not in defaults or value != defaults[name]}
     # RePaint uses the noise scaling only if eta is not 1.
+    if options.get("repaint", {}).get("known_guidance_scale") == 1:
+        del options["repaint"]["known_guidance_scale"]
     if "repaint" in options and options["repaint"].get("eta") != 1:
         options["noise_scaling"] = pipeline.config.noise_scaling
     if "repaint" in options and "eta" not in options["repaint"]:

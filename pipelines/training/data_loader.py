@@ -1,9 +1,9 @@
 """Load training batches from tables. Ray tasks read samples in advance.
 
 The order of the samples depends only on the seed. The order is fixed before the first sample is read. Each epoch visits
-the shards in random order and shuffles the rows within windows of a few shards. Each worker uses its rank and the step
-to compute the rows that it needs. A resumed run therefore continues with the next batch. The samples of two workers,
-taken together, are the samples that a single worker would read.
+the shards in random order and shuffles the samples within windows of a few shards. Each worker uses its rank and the
+step to compute the rows that it needs. A resumed run therefore continues with the next batch. The samples of two
+workers, taken together, are the samples that a single worker would read.
 
 The loader does not use Ray Data, whose executor runs in the training process. While finished blocks wait, the executor
 polls without pauses and holds the global interpreter lock of Python. With Ray Data, training steps on two cores take up
@@ -47,19 +47,26 @@ class Stream:
 
     Attributes:
         shards: Shards of the training split.
-        counts: Number of scenes of each shard.
+        counts: Number of samples of each shard in an epoch.
         batch_size: Global batch size.
         seed: Seed of the order.
+        rows: Row of each sample of each shard in an epoch; a row may be repeated. Empty: each row once.
+
+    Raises:
+        ValueError: There are no samples, or `rows` and `counts` differ in length.
     """
 
     shards: tuple[Shard, ...]
     counts: tuple[int, ...]
     batch_size: int
     seed: int
+    rows: tuple[tuple[int, ...], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.shards or sum(self.counts) == 0:
             raise ValueError("the training split has no scenes")
+        if self.rows and tuple(map(len, self.rows)) != self.counts:
+            raise ValueError(f"rows has {list(map(len, self.rows))} entries per shard, counts {list(self.counts)}")
 
     def positions(self, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the shard and the row of each of the samples first .. first + count - 1 of the stream."""
@@ -70,12 +77,14 @@ class Stream:
             here = wanted // epoch_size == epoch
             shards, rows = shuffle_epoch(self.counts, self.seed, int(epoch))
             shard[here], row[here] = shards[wanted[here] % epoch_size], rows[wanted[here] % epoch_size]
+        if self.rows:
+            row = np.array([self.rows[k][i] for k, i in zip(shard, row, strict=True)], np.int64)
         return shard, row
 
 
 @lru_cache(maxsize=4)
 def shuffle_epoch(counts: tuple[int, ...], seed: int, epoch: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the shard and row of all scenes, in the order of one epoch.
+    """Return the shard, and the index within the shard, of all samples in the order of one epoch.
 
     The shards are in random order. Rows are shuffled within windows of WINDOW_SHARDS shards.
     """
@@ -280,6 +289,12 @@ def _read_latents(shard: Shard, latents_root: str, label: str) -> Arrays:
 
 
 LABEL_COLUMNS = ("vegetation_density", "vehicle_density", "free_pose")  # Columns that determine a label.
+
+
+def repeat_crops(scenes: pa.Table, repeats: int) -> tuple[int, ...]:
+    """Return the rows of a scenes table, each crop at any place `repeats` times and each view of a vehicle once."""
+    crop = np.array(scenes["free_pose"].to_pylist(), bool)
+    return tuple(np.repeat(np.arange(len(crop)), np.where(crop, repeats, 1)).tolist())
 
 
 def label_indices(scenes: pa.Table, label: str) -> np.ndarray:

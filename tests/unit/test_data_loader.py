@@ -1,14 +1,17 @@
 """Tests of the stream of training samples: the scenes of each epoch, with different numbers of workers."""
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from helpers import SHARD_SIZES, small_spec
 
+from jobs.implementation.train_dit import make_stream
 from jobs.support.trainer import with_scene_ids
+from jobs.train_dit import Config
 from models.augment import Augmentation
 from models.tensors import encode_layout
 from models.training import NonFiniteLossError
-from pipelines.training.data_loader import LayoutReader, Stream, read_samples
+from pipelines.training.data_loader import LayoutReader, Stream, read_samples, repeat_crops
 
 
 def test_stream_visits_scenes_once_per_epoch_in_new_order(layout_shards):
@@ -18,6 +21,28 @@ def test_stream_visits_scenes_once_per_epoch_in_new_order(layout_shards):
     assert all(set(epoch) == everything and len(epoch) == 25 for epoch in epochs)
     assert epochs[0] != epochs[1] != epochs[2]
     assert stream.positions(20, 10)[0].tolist() == [k for k, _ in (epochs[0] + epochs[1])[20:30]]
+
+
+def test_repeated_rows_are_visited_that_often_per_epoch(layout_shards):
+    crop = {2, 5, 9, 10, 24}  # Numbers of scenes over all shards.
+    first = np.cumsum([0, *SHARD_SIZES])
+    tables = [pa.table({"free_pose": [first[k] + row in crop for row in range(n)]}) for k, n in enumerate(SHARD_SIZES)]
+    rows = tuple(repeat_crops(table, 3) for table in tables)
+    stream = Stream(layout_shards, tuple(map(len, rows)), 4, 0, rows)
+    shard, row = stream.positions(0, 25 + 2 * len(crop))
+    visits = np.bincount(first[shard] + row, minlength=25)
+    assert visits.tolist() == [3 if k in crop else 1 for k in range(25)]
+    with pytest.raises(ValueError, match="rows has"):
+        Stream(layout_shards, SHARD_SIZES, 4, 0, rows)
+
+
+def test_crop_repeats_needs_crops(layout_shards):
+    shards = list(layout_shards)
+    assert make_stream(Config(), shards, 4) == Stream(layout_shards, SHARD_SIZES, 4, 0)
+    with pytest.raises(ValueError, match="--crop-repeats 2: the dataset has no crops"):
+        make_stream(Config(crop_repeats=2), shards, 4)
+    with pytest.raises(ValueError, match="--crop-repeats 0: use 1 or more"):
+        make_stream(Config(crop_repeats=0), shards, 4)
 
 
 def test_read_samples_equals_layouts_of_stored_scenes(layout_shards):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import QUICK, random_scene, small_spec, tiny_pipeline
+from torch import Tensor
 
 from models.composition.infinite import InfiniteScene
 from models.composition.inpaint import make_latent_mask
@@ -13,7 +14,15 @@ from models.composition.outpaint import choose_arrangement, label_blocks
 from models.dit import DiT
 from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS
-from models.sampling.diffusion import InpaintCondition, SamplingSchedule, SceneNoise, join_known, sample, with_known
+from models.sampling.diffusion import (
+    Diffusion,
+    InpaintCondition,
+    SamplingSchedule,
+    SceneNoise,
+    join_known,
+    sample,
+    with_known,
+)
 from models.sampling.known_regions import BAND, NUM_UNIFORM, ONE_CONTENT, make_training_masks
 from models.sampling.repaint import RePaintConfig, TrainedInpainting
 from models.training import DiffusionLossConfig, make_dit_settings, make_dit_trainer
@@ -121,6 +130,41 @@ def test_every_sampler_keeps_the_known_part(pipeline, sampler):
     one = InpaintCondition(condition.latent[1:], condition.mask[1:])
     alone = pipeline.inpaint_latents(one, ["high"], 5, [1], TrainedInpainting(10))
     assert torch.allclose(alone[0], made[1], atol=1e-4)
+
+
+def test_known_guidance_extrapolates_at_noisy_timesteps():
+    """A network that returns the sum of the known latent adds scale times this sum at noisy timesteps only."""
+    condition = draw_condition((2, SIZE, SIZE), 3)
+    diffusion, label = Diffusion(), torch.zeros(2, dtype=torch.long)
+    latent = torch.randn(2, 2, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
+
+    def model(joined: Tensor, timestep: Tensor, label: Tensor) -> Tensor:
+        noisy, known, _ = joined.split(2, dim=1)
+        return noisy + known.sum((1, 2, 3), keepdim=True)
+
+    total = (condition.latent * (1 - condition.mask)).sum((1, 2, 3), keepdim=True)
+    for timestep, factor in ((299, 1.0), (300, 2.5), (999, 2.5)):
+        predict = with_known(model, condition, diffusion, 2.5)
+        made = predict(latent, torch.full((2,), timestep), label)
+        assert torch.allclose(made[..., 3:], (latent + factor * total)[..., 3:], atol=1e-4), timestep
+    plain = with_known(model, condition, diffusion)(latent, torch.full((2,), 999), label)
+    assert torch.allclose(plain[..., 3:], (latent + total)[..., 3:], atol=1e-4)
+
+
+def test_known_guidance_moves_samples_and_keeps_the_known_part(pipeline):
+    pipeline.use_sampler("dpm++")
+    condition = draw_condition(pipeline.latent_shape, 3)
+    arguments = ["low", "high"], 5, [0, 1]
+    plain, guided = (
+        pipeline.inpaint_latents(condition, *arguments, TrainedInpainting(6, scale)) for scale in (1.0, 2.0)
+    )
+    assert torch.equal(guided[..., :3], condition.latent[..., :3])
+    assert not torch.allclose(plain[..., 3:], guided[..., 3:], atol=1e-3)
+    nothing = draw_condition(pipeline.latent_shape, 0)
+    alone = pipeline.inpaint_latents(nothing, *arguments, TrainedInpainting(6, 2.0))
+    assert torch.allclose(alone, pipeline.sample_latents(*arguments, 6), atol=1e-5)
+    with pytest.raises(ValueError, match=r"known_guidance_scale is -1, expected 0 to 100"):
+        TrainedInpainting(6, -1)
 
 
 def test_empty_known_part_is_ordinary_sampling(pipeline):
