@@ -24,6 +24,7 @@ from pipelines.evaluation.cities import (
     TOWN_SEEDS_START,
     CityRequest,
     CityResult,
+    Label,
     RunRecord,
     compute_quantity_scores,
     compute_whole_scores,
@@ -51,8 +52,6 @@ ENOUGH_WINDOWS = 100
 MIN_WINDOWS = 6  # Scores with 3 neighbours need more than 3 windows.
 MIN_EXTENT_M = 192.0  # Rings 0 and 1.
 SHOWN = 2  # Number of overviews per side.
-
-Label = tuple[str | None, str | None]
 
 
 def evaluate_city(config: Config) -> dict:
@@ -93,6 +92,7 @@ def evaluate_city(config: Config) -> dict:
             seams_m=records[side].seams_m,
             traffic=traffic,
             label=label,
+            block_labels=records[side].block_labels,
         )
         for side, listed in cities.items()
         for number, city in enumerate(listed)
@@ -137,7 +137,8 @@ def evaluate_city(config: Config) -> dict:
         overviews = [
             Picture(result.city, result.overview, side) for side, found in by_side.items() for result in found[:SHOWN]
         ]
-        how = describe(config, dataset, label, by_side, count, reference_rows)
+        has_map = any(record.block_labels for record in records.values())
+        how = describe(config, dataset, label, by_side, count, reference_rows, has_map)
         storage.write_text(render_city_html(nested, rows, overviews, how), storage.join_uri(output, "city.html"))
         return nested
 
@@ -254,6 +255,7 @@ def describe(
     by_side: dict[str, list[CityResult]],
     count: int,
     reference_rows: list[dict],
+    has_map: bool,
 ) -> list[str]:
     """Return the sentences of the page about the compared sets."""
     control = (
@@ -272,6 +274,7 @@ def describe(
         " as high as in the reference. Intervals treat windows as independent. They are too narrow, because windows of"
         " one city resemble each other.",
         "Street directions, city blocks and connectivity use all windows of the towns, whatever their label.",
+        *(["Each window has the label of the nearest block of --labels-map."] if has_map else []),
         *([] if find_sumo() else ["Traffic was not simulated, because SUMO is not installed (extra traffic)."]),
     ]
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.distance import jensenshannon
 
-from models.composition.outpaint import RANKS, BlockGrid
+from models.composition.outpaint import RANKS, BlockGrid, BlockIndex
 from models.labels import ANY, FREE
 from models.scene import DENSITIES, Grid, Scene
 from models.tensors import resample_scene_ground
@@ -49,6 +49,7 @@ FINE_CELLS = 1024  # A block in finer cells than those of any model, because rec
 OVERVIEW_PX = 768
 REFERENCE, CEILING = "reference", "ceiling"
 TOWN_SEEDS_START = 2_000_000  # Towns of the ceiling have other seeds than those of datasets.
+Label = tuple[str | None, str | None]  # Densities of vegetation and vehicles; None: any.
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,35 @@ class CityResult:
     traffic: Traffic | None
 
 
+class BlockLabels(NamedTuple):
+    """Requested labels of the blocks of a run with --labels-map.
+
+    Attributes:
+        labels: Label of each block.
+        step_m: Distance between neighbouring blocks (m).
+    """
+
+    labels: dict[BlockIndex, Label]
+    step_m: float
+
+    def find_label(self, ahead_m: float, left_m: float) -> Label:
+        """Return the label of the block whose centre is nearest to a point.
+
+        Args:
+            ahead_m: Distance of the point ahead of the centre of block (0, 0) (m).
+            left_m: Distance of the point to the left of this centre (m).
+
+        Returns:
+            The label.
+        """
+        rows, cols = zip(*self.labels, strict=True)
+        ahead, left = (
+            int(np.clip(round(at_m / self.step_m), min(steps), max(steps)))
+            for at_m, steps in ((ahead_m, rows), (left_m, cols))
+        )
+        return self.labels[ahead, left]
+
+
 @dataclass(frozen=True)
 class CityRequest:
     """One large scene to measure.
@@ -95,6 +125,7 @@ class CityRequest:
         traffic: Whether to simulate traffic with SUMO.
         label: Requested densities of vegetation and vehicles; None: any. Windows of a procedural town are kept only if
             they have these densities.
+        block_labels: Labels of the blocks, of which each window has that of the nearest block; None: `label`.
     """
 
     side: str
@@ -105,7 +136,8 @@ class CityRequest:
     extent_m: float = 0.0
     seams_m: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
     traffic: bool = False
-    label: tuple[str | None, str | None] = (None, None)
+    label: Label = (None, None)
+    block_labels: BlockLabels | None = None
 
 
 def find_seams_m(block_grid: BlockGrid, cell_m: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -143,12 +175,14 @@ class RunRecord(NamedTuple):
         seams_m: Positions of seams along x and y (`find_seams_m`); none if they are unknown.
         corner_m: x of the rear border and y of the right border of scenes in tiles (m); None if scenes are whole.
         size_m: Length and width of scenes in tiles (m); None if scenes are whole.
+        block_labels: Labels of the blocks; None without --labels-map.
     """
 
-    label: tuple[str | None, str | None] | None = None
+    label: Label | None = None
     seams_m: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
     corner_m: tuple[float, float] | None = None
     size_m: tuple[float, float] | None = None
+    block_labels: BlockLabels | None = None
 
 
 def read_run_record(root: str, source: str) -> RunRecord:
@@ -169,18 +203,24 @@ def read_run_record(root: str, source: str) -> RunRecord:
     grid = BlockGrid.from_overlap(
         FINE_CELLS, options["overlap"], rank=RANKS[options["order"]], num_blocks=tuple(options["num_blocks"])
     )
-    seams_m = find_seams_m(grid, WINDOW_M / FINE_CELLS)
-    if not options.get("tile_m"):
-        return RunRecord(label, seams_m)
     ahead, behind, left, right = options["num_blocks"]
     step_m = WINDOW_M * (1 - options["overlap"])
-    corner_m = -behind * step_m, -WINDOW_M / 2 - right * step_m
-    return RunRecord(
-        label, seams_m, corner_m, (WINDOW_M + (ahead + behind) * step_m, WINDOW_M + (left + right) * step_m)
-    )
+    record = RunRecord(label, find_seams_m(grid, WINDOW_M / FINE_CELLS))
+    if rows := options.get("labels_map"):
+        labels = {
+            (ahead - row, left - col): parse_label(name)
+            for row, names in enumerate(rows)
+            for col, name in enumerate(names)
+        }
+        record = record._replace(label=(None, None), block_labels=BlockLabels(labels, step_m))
+    if options.get("tile_m"):
+        corner_m = -behind * step_m, -WINDOW_M / 2 - right * step_m
+        size_m = WINDOW_M + (ahead + behind) * step_m, WINDOW_M + (left + right) * step_m
+        record = record._replace(corner_m=corner_m, size_m=size_m)
+    return record
 
 
-def parse_label(text: str) -> tuple[str | None, str | None]:
+def parse_label(text: str) -> Label:
     """Return the densities of vegetation and vehicles that a label names; None for a density that it does not name.
 
     Args:
@@ -242,6 +282,8 @@ def measure_city_windows(
         judged = judge_densities(scene, dataset.vegetation, dataset.vehicle)
         kept = bool(job.tiles) or all(wanted in (None, own) for wanted, own in zip(job.label, judged, strict=True))
         vegetation, vehicle = job.label if job.tiles else judged
+        if job.block_labels:
+            vegetation, vehicle = job.block_labels.find_label(*place)
         own_m = find_origin_level_m(scene)
         if np.isfinite(own_m):
             scene = scene.translate(0.0, 0.0, level_m - own_m)
@@ -344,9 +386,7 @@ def measure_reference_part(
     return rows, [find_origin_level_m(scene) for scene in scenes]
 
 
-def select_reference(
-    dataset: Dataset, split: str, label: tuple[str | None, str | None], limit: int
-) -> list[tuple[Shard, list[int]]]:
+def select_reference(dataset: Dataset, split: str, label: Label, limit: int) -> list[tuple[Shard, list[int]]]:
     """Select evenly spaced scenes of the data that have a label; crops at any place if the dataset has such crops.
 
     Args:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import random_scene
 
-from models.composition.outpaint import RANKS, BlockGrid
+from models.composition.outpaint import RANKS, BlockGrid, label_blocks
 from models.scene import VEGETATION, VEHICLES
 from pipelines.evaluation.cities import (
     CityResult,
@@ -53,6 +53,20 @@ def test_label_is_read_from_the_record_of_a_run(tmp_path):
         assert read_run_record(str(tmp_path), "generated-city").label == label
     with pytest.raises(ValueError, match="density 'lots' is unknown, expected one of low, medium, high, any"):
         parse_label("lots-any")
+
+
+def test_windows_have_the_label_of_the_nearest_block(tmp_path):
+    rows = [["low-low", "low-medium", "low-high"], ["high-low", "any-medium-free", "high-high"]]
+    options = {"overlap": 0.25, "num_blocks": [1, 0, 1, 1], "order": "colours", "labels_map": rows, "label": None}
+    (tmp_path / "generated-city.json").write_text(json.dumps(options))
+    record = read_run_record(str(tmp_path), "generated-city")
+    assert record.label == (None, None) and record.block_labels is not None
+    by_block = label_blocks("partial", rows, (1, 0, 1, 1))
+    assert {index: parse_label(name) for index, name in by_block.items()} == record.block_labels.labels
+    find = record.block_labels.find_label
+    # Blocks are 48 m apart; the nearest block of a point beyond the border is the last one.
+    assert find(0, 0) == find(23, -23) == (None, "medium") and find(25, 0) == ("low", "medium")
+    assert find(64, 64) == find(500, 500) == ("low", "low") and find(-64, -64) == ("high", "high")
 
 
 def test_windows_of_the_first_rings_share_a_source():
