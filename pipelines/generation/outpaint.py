@@ -40,7 +40,7 @@ from pipelines.generation.sample import (
 )
 from pipelines.io.mesh_export import export_glb
 from pipelines.io.tileset import TileContent, find_tile_bounds, make_tileset
-from pipelines.reporting.city_page import pack_tile, render_city_html
+from pipelines.reporting.city_page import pack_overview, pack_tile, render_city_html
 from pipelines.runtime import storage
 from pipelines.runtime.resources import make_model_resources, require_room
 from pipelines.schema.scene_subset import SceneSubset
@@ -333,6 +333,8 @@ class Outpainter:
             storage.write_json(bounds, storage.join_uri(request.output, "glb", request.run, name, f"{part}.json"))
             page = make_page_path(request, task.number, "tiles", f"{part}.js")
             storage.write_text(pack_tile(part, scene), page)
+            far = make_page_path(request, task.number, "tiles", f"{part}-far.js")
+            storage.write_text(pack_overview(part, scene), far)
             scene, name, path = tile.to_own_frame(scene), f"{name}-{part}", f"{name}/{part}.glb"
         scene = replace(scene, scene_id=name, source=request.source, split="generated", frame=task.number)
         path = storage.join_uri(request.output, "glb", request.run, path)

@@ -6,6 +6,7 @@ import base64
 import io
 import math
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -16,6 +17,7 @@ from pipelines.geometry.masks import find_nearest_true
 from pipelines.schema.palette import CATEGORY_CLASS_ID, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
 
 NODES = 65  # Number of ground heights along the longer side. In a crop, the spacing is 1 m.
+OVERVIEW_NODES = 17
 
 
 def export_web_scene(scene: Scene, ground: dict | None = None) -> dict:
@@ -38,6 +40,20 @@ def export_web_scene(scene: Scene, ground: dict | None = None) -> dict:
     }
 
 
+def export_web_overview(scene: Scene, picture: np.ndarray) -> dict:
+    """Convert a scene to JSON for views from afar: coarse ground, on which a picture shows the objects.
+
+    Args:
+        scene: Scene.
+        picture: (h, w, 3) uint8 picture of the scene from above; ahead is up.
+
+    Returns:
+        Dictionary with the keys of `export_web_scene`; it has no primitives.
+    """
+    of_ground = _export_heights(scene, OVERVIEW_NODES) | {"picture": _encode_png(Image.fromarray(picture).quantize())}
+    return {"scene_id": scene.scene_id, "grid": asdict(scene.grid), "ground": of_ground, "primitives": []}
+
+
 def export_ground(scene: Scene) -> dict:
     """Convert the ground of a scene to JSON for the viewer.
 
@@ -47,14 +63,19 @@ def export_ground(scene: Scene) -> dict:
     Returns:
         Dictionary with the keys rows, cols, height_cm and picture.
     """
+    return _export_heights(scene, NODES) | {"picture": draw_ground(scene)}
+
+
+def _export_heights(scene: Scene, nodes: int) -> dict:
+    """Return rows, cols and height_cm of the ground, with a number of heights along the longer side."""
     height_m, winner = scene.surface()
     filled_m = height_m if (winner < 0).all() else height_m[find_nearest_true(winner >= 0)]
-    step = max(winner.shape) / (NODES - 1)
+    step = max(winner.shape) / (nodes - 1)
     rows, cols = (max(2, round(n / step) + 1) for n in winner.shape)
     at = [np.linspace(-0.5, n - 0.5, count) for n, count in zip(winner.shape, (rows, cols), strict=True)]
     nodes_m = ndimage.map_coordinates(filled_m, np.meshgrid(*at, indexing="ij"), order=1, mode="nearest")
     height_cm = np.round(100 * nodes_m).astype(int).ravel().tolist()
-    return {"rows": rows, "cols": cols, "height_cm": height_cm, "picture": draw_ground(scene)}
+    return {"rows": rows, "cols": cols, "height_cm": height_cm}
 
 
 def draw_ground(scene: Scene) -> str:
@@ -69,8 +90,13 @@ def draw_ground(scene: Scene) -> str:
     class_id = list_ground_ids(scene)[scene.surface()[1]]
     image = Image.fromarray(class_id, "P")
     image.putpalette(CLASS_COLORS.ravel().tolist())
+    return _encode_png(image, transparency=EMPTY)
+
+
+def _encode_png(image: Image.Image, **options: Any) -> str:
+    """Return a PNG image as a data URI."""
     file = io.BytesIO()
-    image.save(file, "PNG", optimize=True, transparency=EMPTY)
+    image.save(file, "PNG", optimize=True, **options)
     return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 

@@ -1,6 +1,7 @@
 """Render a city of tiles as an HTML page that loads the tiles near the camera.
 
-The page needs no server and no installation: it opens as a file. Tiles are scripts in the directory `tiles` next to it.
+The page needs no server and no installation: it opens as a file. Tiles are scripts in the directory `tiles` next to it,
+and so are their views from afar, which the page shows where no tile is loaded.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ from collections.abc import Mapping
 from html import escape
 
 from models.scene import Grid, Scene
-from pipelines.io.web_export import export_web_scene
+from pipelines.io.web_export import export_web_overview, export_web_scene
+from pipelines.rendering.render import render_bev
 from pipelines.reporting.gallery_page import read_script
 from pipelines.reporting.report_style import STYLE
 
-MAX_REACH_M = 600.0  # Tiles farther from the centre of the view are not shown.
+MAX_REACH_M = 600.0  # Tiles farther from the centre of the view are shown as pictures on coarse ground.
+OVERVIEW_PIXEL_M = 2.0  # Side of a pixel of these pictures.
 
 
 def pack_tile(name: str, scene: Scene) -> str:
@@ -29,9 +32,28 @@ def pack_tile(name: str, scene: Scene) -> str:
     Returns:
         Content of tiles/<name>.js.
     """
-    content = json.dumps(export_web_scene(scene), separators=(",", ":")).encode()
-    packed = base64.b64encode(gzip.compress(content, mtime=0)).decode()
-    return f'tile({json.dumps(name)}, "{packed}");\n'
+    return _pack_script("tile", name, export_web_scene(scene))
+
+
+def pack_overview(name: str, scene: Scene) -> str:
+    """Return the script with the view of a tile from afar.
+
+    Args:
+        name: Name of the tile.
+        scene: Content of the tile in the frame of the city.
+
+    Returns:
+        Content of tiles/<name>-far.js.
+    """
+    grid = scene.grid
+    picture = render_bev(scene, round(max(grid.rows, grid.cols) * grid.resolution_m / OVERVIEW_PIXEL_M))
+    return _pack_script("overview", name, export_web_overview(scene, picture))
+
+
+def _pack_script(function: str, name: str, content: dict) -> str:
+    """Return a script that calls a function of city.js with a name and with packed JSON."""
+    packed = base64.b64encode(gzip.compress(json.dumps(content, separators=(",", ":")).encode(), mtime=0)).decode()
+    return f'{function}({json.dumps(name)}, "{packed}");\n'
 
 
 def render_city_html(title: str, tiles: Mapping[str, Grid]) -> str:

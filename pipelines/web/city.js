@@ -5,7 +5,7 @@
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const viewer = new Viewer(document.getElementById("view"));
-const tiles = new Map(data.tiles.map((tile) => [tile.name, { ...tile, parts: null, loading: false }]));
+const tiles = new Map(data.tiles.map((tile) => [tile.name, { ...tile, parts: null, loading: false, far: null, farParts: null }]));
 const keys = new Set();
 let flying = false, last = 0;
 
@@ -25,29 +25,57 @@ function distance(tile) {
 function choose() {
   const order = [...tiles.values()].sort((a, b) => distance(a) - distance(b));
   for (const tile of order) {
-    if (tile.parts && distance(tile) > 1.3 * reach()) { viewer.remove(tile.parts); tile.parts = null; }
-    if (!tile.parts && !tile.loading && distance(tile) <= reach()) load(tile);
+    if (tile.parts && distance(tile) > 1.3 * reach()) { viewer.remove(tile.parts); tile.parts = null; showFar(tile); }
+    if (!tile.parts && !tile.loading && distance(tile) <= reach()) {
+      tile.loading = true;
+      load(tile.name, () => { document.getElementById("count").textContent = `tiles/${tile.name}.js cannot be read`; });
+    }
   }
   const shown = order.filter((tile) => tile.parts).length;
   document.getElementById("count").textContent = `${shown} of ${tiles.size} tiles`;
 }
 
-function load(tile) {
-  tile.loading = true;
+function load(name, onerror) {
   const script = document.createElement("script");
-  script.src = `tiles/${tile.name}.js`;
-  script.onerror = () => { document.getElementById("count").textContent = `tiles/${tile.name}.js cannot be read`; };
+  script.src = `tiles/${name}.js`;
+  script.onerror = onerror;
   document.head.append(script);
 }
 
-window.tile = async (name, content) => {
-  const tile = tiles.get(name), bytes = Uint8Array.from(atob(content), (c) => c.charCodeAt(0));
+async function unpack(name, content) {
+  const bytes = Uint8Array.from(atob(content), (c) => c.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-  tile.parts = await viewer.add(await new Response(stream).json(), true);
-  tile.loading = false;
   for (const script of document.querySelectorAll(`script[src="tiles/${name}.js"]`)) script.remove();
-  viewer.draw();
+  return new Response(stream).json();
+}
+
+window.tile = async (name, content) => {
+  const tile = tiles.get(name);
+  tile.parts = await viewer.add(await unpack(name, content), true);
+  tile.loading = false;
+  showFar(tile);
 };
+
+// Each tile also has a view from afar, which is shown while the tile is not.
+window.overview = async (name, content) => {
+  const tile = tiles.get(name);
+  tile.far = await unpack(`${name}-far`, content);
+  showFar(tile);
+};
+
+// Show or remove the view of a tile from afar, depending on whether the tile is shown.
+async function showFar(tile) {
+  if (tile.far && !tile.parts && !tile.farParts) {
+    tile.farParts = [];
+    tile.farParts = await viewer.add(tile.far, true);
+  }
+  if (tile.parts && tile.farParts?.length) { viewer.remove(tile.farParts); tile.farParts = null; }
+  const far = [...tiles.values()].filter((one) => one.farParts?.length).length;
+  document.getElementById("view").dataset.far = far;
+  viewer.draw();
+}
+
+for (const tile of tiles.values()) load(`${tile.name}-far`, () => {});  // Pages of earlier versions have no such files.
 
 // Keys move the camera: W, A, S, D or arrows; Q and E turn it. The button flies along the view and turns at the border.
 addEventListener("keydown", (event) => { keys.add(event.key.toLowerCase()); step(0); });
