@@ -1,4 +1,4 @@
-"""An unbounded scene that generates any block on demand at bounded cost, independently of earlier requests."""
+"""An unbounded scene that generates any block on demand, independently of earlier requests."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from models.composition.generator import SceneGenerator
 from models.composition.outpaint import (
+    RANKS,
     BlockComposer,
     BlockGrid,
     BlockIndex,
@@ -15,7 +16,6 @@ from models.composition.outpaint import (
     check_roads,
     find_ground_height,
     generate_blocks,
-    rank_four_colors,
 )
 from models.composition.road_sketch import SketchedRoad
 from models.sampling.repaint import InpaintingConfig
@@ -23,27 +23,31 @@ from models.scene import Grid, Scene
 
 
 class InfiniteScene:
-    """An unbounded scene of blocks with four ranks (`outpaint.rank_four_colors`).
+    """An unbounded scene of blocks.
 
-    Each block directly depends on at most eight neighbours and on block (0, 0). Block (0, 0) sets the ground height.
-    Generated blocks are kept in memory until `drop_block` is called.
+    Block (0, 0) sets the ground height. With the default order, the cost of a block is bounded. Generated blocks are
+    kept in memory until `drop_block` is called.
 
     Args:
         model: A PrITTIPipeline.
         label: One label for all blocks, or a function that returns the label for a block index.
         seed: Seed of the scene.
-        overlap: Fraction of a block that overlaps its neighbour; it must be below 0.5.
+        overlap: Fraction of a block that overlaps its neighbour; it must be below 0.5 with the order "colours".
         mode: "reencode", "copy" or "paper"; see `PrITTIPipeline.outpaint`.
         repaint: Options of inpainting; None: see `resolve_inpainting`.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         scene: Content of block (0, 0), on the model's grid. None: block (0, 0) is generated.
-        scene_index: Index of the scene. With the same scene, seed, index and labels, each block equals that of
-            `PrITTIPipeline.outpaint` in the order "colours", up to rounding. Blocks at the border of the latter are
-            equal if its numbers of blocks are even.
+        scene_index: Index of the scene. With the same scene, seed, index, labels and order, each block equals that of
+            `PrITTIPipeline.outpaint`, up to rounding. With "colours", blocks at the border of the latter are equal if
+            its numbers of blocks are even.
         roads: Sketched roads, in the frame of block (0, 0); they need the mode "reencode" and split latents.
+        order: Order of the blocks, a key of RANKS. With "colours", each block depends on at most eight neighbours and
+            on block (0, 0). With "outward", it depends on all blocks of a rectangle with block (0, 0).
 
     Raises:
-        ValueError: The label is unknown to the model, the overlap is 0.5 or more, or the model cannot follow the roads.
+        KeyError: The order is unknown.
+        ValueError: The label is unknown to the model, the overlap is 0.5 or more with "colours", or the model cannot
+            follow the roads.
     """
 
     def __init__(
@@ -58,10 +62,11 @@ class InfiniteScene:
         scene: Scene | None = None,
         scene_index: int = 0,
         roads: Sequence[SketchedRoad] = (),
+        order: str = "colours",
     ) -> None:
         self.model, self.label, self.seed, self.scene_index = model, label, seed, scene_index
         self.options: dict[str, Any] = {"mode": mode, "repaint": repaint, "guidance_scale": guidance_scale}
-        block_grid = BlockGrid.from_overlap(model.latent_shape[-1], overlap, rank=rank_four_colors, num_blocks=None)
+        block_grid = BlockGrid.from_overlap(model.latent_shape[-1], overlap, rank=RANKS[order], num_blocks=None)
         self.composer = BlockComposer(block_grid, model.spec, model.encode, roads=roads)
         self.blocks: dict[BlockIndex, SceneBlock] = {}
         self.scene = scene
@@ -89,28 +94,40 @@ class InfiniteScene:
         Returns:
             The block.
         """
-        if index == (0, 0) and self.scene is not None:
-            self.blocks.setdefault(index, SceneBlock(self.scene, self.model.encode([self.scene])[0]))
-        if index not in self.blocks:
-            known = {other: self.get_block(other) for other, _ in self.composer.block_grid.known_cells(index)}
-            if known:
-                self.composer.level_m = find_ground_height(self.get_block((0, 0)).scene, 0.0, 0.0)
-            label = self.label_of(index)
-            like = self.model.new_identity("city", self.seed, 0, label)
-            # Generate one block at a time. Rounding differs between batch sizes. If blocks were generated in batches,
-            # the content of a block would depend on the requests.
-            self.blocks |= generate_blocks(
-                self.model,
-                self.composer,
-                [index],
-                known,
-                like,
-                {index: label},
-                self.seed,
-                self.scene_index,
-                **self.options,
-            )
+        waiting = [index]  # A loop, because with the order "outward", blocks may have thousands of predecessors.
+        while waiting:
+            needs = [other for other, _ in self.composer.block_grid.known_cells(waiting[-1])]
+            missing = [other for other in ((0, 0), *needs) if other not in self.blocks] if needs else []
+            if missing and waiting[-1] not in self.blocks:
+                waiting += missing
+                continue
+            last = waiting.pop()
+            if last not in self.blocks:
+                self._generate_block(last, {other: self.blocks[other] for other in needs})
         return self.blocks[index]
+
+    def _generate_block(self, index: BlockIndex, known: dict[BlockIndex, SceneBlock]) -> None:
+        """Generate a block whose predecessors exist; block (0, 0) may be given."""
+        if index == (0, 0) and self.scene is not None:
+            self.blocks[index] = SceneBlock(self.scene, self.model.encode([self.scene])[0])
+            return
+        if known:
+            self.composer.level_m = find_ground_height(self.blocks[0, 0].scene, 0.0, 0.0)
+        label = self.label_of(index)
+        like = self.model.new_identity("city", self.seed, 0, label)
+        # Generate one block at a time. Rounding differs between batch sizes. If blocks were generated in batches, the
+        # content of a block would depend on the requests.
+        self.blocks |= generate_blocks(
+            self.model,
+            self.composer,
+            [index],
+            known,
+            like,
+            {index: label},
+            self.seed,
+            self.scene_index,
+            **self.options,
+        )
 
     def drop_block(self, index: BlockIndex) -> None:
         """Free the memory of a block. A later request regenerates the same block.

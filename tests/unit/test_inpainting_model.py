@@ -214,13 +214,15 @@ def test_arrangement_changes_with_the_distance():
         choose_arrangement((1, 1, 1, 1), "spiral")
 
 
-def test_infinite_scene_has_the_blocks_of_the_large_scene(pipeline):
+@pytest.mark.parametrize(("order", "overlap"), [("colours", 0.25), ("outward", 0.25), ("outward", 0.5)])
+def test_infinite_scene_has_the_blocks_of_the_large_scene(pipeline, order, overlap):
     """The blocks at the border of the large scene are equal too, because its numbers of blocks are even."""
     pipeline.use_sampler("dpm++")
     scene = random_scene(2, grid=pipeline.spec.grid)
     steps, options = (2, 0, 0, 2), {"repaint": TrainedInpainting(4), "mode": "reencode"}
-    large = pipeline.outpaint(scene, "low", seed=3, index=1, num_blocks=steps, **options)
-    assert large.grid.rows == 32 + 2 * 24
+    large = pipeline.outpaint(scene, "low", seed=3, index=1, num_blocks=steps, order=order, overlap=overlap, **options)
+    assert large.grid.rows == 32 + 2 * 32 * (1 - overlap)
+    options |= {"order": order, "overlap": overlap}
     labels = label_blocks(pipeline.dit.config.label, "low", steps, "all")
     infinite = InfiniteScene(pipeline, labels.__getitem__, seed=3, scene=scene, scene_index=1, **options)
     infinite.drop_block((0, 0))

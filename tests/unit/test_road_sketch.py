@@ -10,6 +10,7 @@ from helpers import random_scene, small_spec, tiny_pipeline
 from models.composition.outpaint import BlockComposer, BlockGrid, SceneBlock, check_roads
 from models.composition.road_sketch import SketchedRoad, add_sketched_ground, check_sketch, draw_roads
 from models.layout import LayoutSpec
+from models.pipeline import PrITTIPipeline
 from models.scene import KITTI_GROUND_CLASSES, Grid
 from models.tensors import make_empty_scene
 
@@ -106,3 +107,16 @@ def test_roads_need_a_model_that_can_follow_them():
         check_roads([road], street, "copy", True)
     with pytest.raises(ValueError, match="mix ground and objects"):
         check_roads([road], street, "reencode", False)
+
+
+@pytest.mark.slow
+def test_released_model_builds_the_sketched_road():
+    pipeline = PrITTIPipeline.from_pretrained("town")
+    pipeline.set_progress_bar_config(disable=True)
+    (scene,) = pipeline.generate(["medium-medium"], seed=3)
+    sketched = SketchedRoad(((66.0, 0.0), (110.0, 20.0), (158.0, 20.0)), width_m=8.0, sidewalk_m=2.0)
+    shares = []
+    for roads in ([sketched], []):
+        whole = pipeline.outpaint(scene, "medium-medium", num_blocks=(2, 0, 0, 0), roads=roads)
+        shares.append(float(whole.occupied[ROAD][draw_roads([sketched], whole.grid)[0]].mean()))
+    assert shares[0] > 0.95 and shares[1] < 0.7, shares
