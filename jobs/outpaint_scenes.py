@@ -2,17 +2,17 @@
 """Extend scenes by neighbouring blocks on all sides, or to a given extent.
 
     jobs/outpaint_scenes.py                                              the first generated town scene
-    jobs/outpaint_scenes.py --extent-m 512 512 --num-actors 8            512 m x 512 m around it
+    jobs/outpaint_scenes.py --extent-m 544 544 --num-actors 8            544 m x 544 m around it
     jobs/outpaint_scenes.py --blocks-ahead 9 --blocks-behind 0 --blocks-left 0 --blocks-right 0     along its street
     jobs/outpaint_scenes.py --input DIR --source town --split test --max-scenes 8 --num-actors 2
     jobs/outpaint_scenes.py --inpainting repaint                         as in the paper, slowly
-    jobs/outpaint_scenes.py --extent-m 496 496 --labels-map labels.json  one label per block
-    jobs/outpaint_scenes.py --extent-m 2000 2000 --tile-m 256            a city in tiles
+    jobs/outpaint_scenes.py --extent-m 448 448 --labels-map labels.json  one label per block, 9 rows of 9
+    jobs/outpaint_scenes.py --extent-m 1984 1984 --tile-m 256            a city in tiles
 
 By default, the job adds eight blocks around a scene, as in the paper: four sides in one batch, then four corners. The
 job writes scene tables with source=generated-<run> and one GLB file per scene. With --tile-m, it writes one scene and
-one GLB file per tile, a 3D Tiles tileset, glb/<run>/<scene>/tileset.json, and a page on which a camera flies over the
-city, pages/<run>/<scene>/index.html. No process then holds a whole city.
+one GLB file per tile, a 3D Tiles tileset, glb/<run>/<scene>/tileset.json, and a page that shows the city in 3D,
+pages/<run>/<scene>/index.html. No process then holds a whole city.
 
 The tables in block_tables/ contain the share of known ground in each block. The job generates a block as soon as all
 neighbours that the block depends on are complete. The result does not depend on the number of actors. Run the same
@@ -37,7 +37,8 @@ class Config(RePaintOptions):
     run: str = "outpainted"
     """Name of the run: scenes get source=generated-<run>."""
     extent_m: tuple[float, float] | None = None
-    """Length (ahead) and width in metres of the result; replaces the numbers of blocks (default: none)."""
+    """Length (ahead) and width of the result in metres, rounded up to whole blocks on all sides; replaces the numbers
+    of blocks (default: none)."""
     blocks_ahead: int = 1
     """Number of blocks ahead of the scene."""
     blocks_behind: int = 1
@@ -56,8 +57,8 @@ class Config(RePaintOptions):
     replaces --label."""
     free_blocks: Literal["none", "off-street", "all"] | None = None
     """Blocks that are sampled as crops at any place and heading, instead of views of a vehicle: those that do not lie
-    ahead of or behind the given scene (off-street), or all blocks. Only models with labels such as low-medium-free
-    distinguish both (default: none for one block on each side, all over longer distances)."""
+    ahead of or behind the given scene (off-street), or all generated blocks. Only models with labels such as
+    low-medium-free distinguish both (default: none for one block on each side, all over longer distances)."""
     road_sketch: str = ""
     """JSON file with roads that the generated blocks contain: a list of {"points_m": [[x, y], ...], "width_m": 7,
     "sidewalk_m": 2}, in metres in the frame of the given scene, x ahead and y to the left."""

@@ -30,7 +30,7 @@ class Config(GenerationOptions):
     )  # fmt: skip
     """Settings of RePaint: steps, jump length, resamplings, weight of pseudoinverse guidance, eta."""
     trained_steps: tuple[int, ...] = ()
-    """Numbers of denoising steps without RePaint, for an inpainting model such as the released one (default: none)."""
+    """Numbers of denoising steps without RePaint, for a model of train_dit.py --inpainting (default: none)."""
     overlap: float = 0.5
     """Overlap of neighbouring blocks, as a share of the block size."""
     neighbour_latents: tuple[Literal["reencode", "copy", "paper"], ...] = ("reencode",)

@@ -14,7 +14,7 @@ from jobs.support.model_directories import find_pipeline_directory, read_label_k
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import make_execution, make_inpainting_config, select_scenes
-from models.composition.outpaint import HARDLY_KNOWN, Arrangement, choose_arrangement, label_blocks
+from models.composition.outpaint import MIN_KNOWN_GROUND, Arrangement, choose_arrangement, label_blocks
 from models.composition.road_sketch import SketchedRoad
 from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
 from pipelines.runtime import storage
@@ -131,13 +131,13 @@ def outpaint(config: Config) -> list[str]:
 def main(config: Config) -> None:
     tables, output = outpaint(config), config.output_directory()
     known = [storage.read_parquet(path, ["known_ground"])["known_ground"].to_numpy() for path in tables]
-    bare, count = sum(int((share < HARDLY_KNOWN).sum()) for share in known), sum(map(len, known))
+    bare, count = sum(int((share < MIN_KNOWN_GROUND).sum()) for share in known), sum(map(len, known))
     print(f"outpainted scenes, source generated-{config.run}, and GLB files in {output}")
     if config.tile_m is not None:
-        print(f"pages that fly over the cities: {output}/pages/{config.run}/*/index.html")
+        print(f"pages that show the cities in 3D: {output}/pages/{config.run}/*/index.html")
     if bare:
         print(
-            f"{bare} of {count} blocks had almost no known ground (known_ground below {HARDLY_KNOWN} in "
+            f"{bare} of {count} blocks had almost no known ground (known_ground below {MIN_KNOWN_GROUND} in "
             f"{output}/block_tables/{config.run}/*.parquet). They were generated without their surroundings; with "
             "--neighbour-latents paper, they failed, as in the paper"
         )

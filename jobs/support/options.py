@@ -107,7 +107,7 @@ class RePaintOptions(GenerationOptions):
     """Number of denoising steps, without the repetitions of RePaint (default: as the model stores with trained, 250 as
     in the paper with repaint, 50 with guided)."""
     known_guidance_scale: float | None = None
-    """Scale of guidance by the known part with trained; 1 switches this guidance off (default: 1)."""
+    """Scale of guidance by the known part with --inpainting trained; 1 switches this guidance off (default: 1)."""
     jump_length: int | None = None
     """Jump length of RePaint in steps, J in the paper (default: 10)."""
     num_resamplings: int | None = None

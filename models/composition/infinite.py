@@ -8,13 +8,13 @@ from typing import Any
 
 from models.composition.generator import SceneGenerator
 from models.composition.outpaint import (
-    RANKS,
     BlockComposer,
     BlockGrid,
     BlockIndex,
     SceneBlock,
     check_roads,
     find_ground_height,
+    find_rank,
     generate_blocks,
 )
 from models.composition.road_sketch import SketchedRoad
@@ -37,16 +37,16 @@ class InfiniteScene:
         repaint: Options of inpainting; None: see `resolve_inpainting`.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         scene: Content of block (0, 0), on the model's grid. None: block (0, 0) is generated.
-        scene_index: Index of the scene. With the same scene, seed, index, labels and order, each block equals that of
+        scene_index: Index of the scene. With the same scene, seed, index, labels and options, each block equals that of
             `PrITTIPipeline.outpaint`, up to rounding. With "colours", blocks at the border of the latter are equal if
             its numbers of blocks are even.
-        roads: Sketched roads, in the frame of block (0, 0); they need the mode "reencode" and split latents.
+        roads: Sketched roads, in the frame of block (0, 0); they need the mode "reencode" and latents with separate
+            channels for ground and objects.
         order: Order of the blocks, a key of RANKS. With "colours", each block depends on at most eight neighbours and
             on block (0, 0). With "outward", it depends on all blocks of a rectangle with block (0, 0).
 
     Raises:
-        KeyError: The order is unknown.
-        ValueError: The label is unknown to the model, the overlap is 0.5 or more with "colours", or the model cannot
+        ValueError: The order or the label is unknown, the overlap is 0.5 or more with "colours", or the model cannot
             follow the roads.
     """
 
@@ -66,7 +66,7 @@ class InfiniteScene:
     ) -> None:
         self.model, self.label, self.seed, self.scene_index = model, label, seed, scene_index
         self.options: dict[str, Any] = {"mode": mode, "repaint": repaint, "guidance_scale": guidance_scale}
-        block_grid = BlockGrid.from_overlap(model.latent_shape[-1], overlap, rank=RANKS[order], num_blocks=None)
+        block_grid = BlockGrid.from_overlap(model.latent_shape[-1], overlap, rank=find_rank(order), num_blocks=None)
         self.composer = BlockComposer(block_grid, model.spec, model.encode, roads=roads)
         self.blocks: dict[BlockIndex, SceneBlock] = {}
         self.scene = scene

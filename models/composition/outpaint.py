@@ -1,7 +1,8 @@
 """Outpainting on a grid of overlapping blocks (paper, supplement B.3).
 
 The paper adds eight blocks around a scene, which gives a grid of three by three blocks. This module also supports
-rectangles of any size and unbounded grids. Only the order of the blocks differs.
+rectangles of any size and unbounded grids. By default, the order, the overlap and the use of neighbours also differ
+from the paper (`choose_arrangement`, MODES).
 
 Block (i, j) lies i steps ahead of block (0, 0) and j steps to its left. A step is (1 - overlap) of a block. The rank of
 a block depends only on (i, j). A cell that several blocks cover is owned by the block with the lowest rank. Blocks of
@@ -36,15 +37,15 @@ BlockIndex = tuple[int, int]  # (i, j): i steps ahead of block (0, 0), j steps t
 # How a block uses its neighbours. "reencode" and "copy" differ in the known latents (`BlockComposer.condition_block`);
 # both blend the ground and remove duplicates. "paper" copies the latents and does neither.
 MODES = ("reencode", "copy", "paper")
-# Blocks that count as crops at any place and heading: none, those off the street of block (0, 0), or all but it.
+# Blocks that count as crops at any place and heading: none, those off the street of block (0, 0), or all but (0, 0).
 FREE_BLOCKS: dict[str, Callable[[BlockIndex], bool]] = {
     "none": lambda index: False,
     "off-street": lambda index: index[1] != 0,
     "all": lambda index: index != (0, 0),
 }
-# A block that knows less ground, as a share of its known pixels, is generated without its surroundings, except with
+# Lowest share of known pixels with ground. Below it, a block is generated without its surroundings, except with
 # "paper". Otherwise, it would continue the empty surroundings, and so would its neighbours.
-HARDLY_KNOWN = 0.1
+MIN_KNOWN_GROUND = 0.1
 EncodeScenes = Callable[[Sequence[Scene]], Tensor]  # Maps scenes on the model's grid to latents (b, c, h, w).
 
 
@@ -73,6 +74,23 @@ def rank_four_colors(index: BlockIndex) -> int:
 
 
 RANKS: dict[str, Callable[[BlockIndex], int]] = {"outward": rank_outward, "colours": rank_four_colors}
+
+
+def find_rank(order: str) -> Callable[[BlockIndex], int]:
+    """Return the function that ranks blocks.
+
+    Args:
+        order: Order of the blocks, a key of RANKS.
+
+    Returns:
+        Function from the index of a block to its rank.
+
+    Raises:
+        ValueError: The order is unknown.
+    """
+    if order not in RANKS:
+        raise ValueError(f"order is {order!r}, expected one of: {', '.join(RANKS)}")
+    return RANKS[order]
 
 
 class Arrangement(NamedTuple):
@@ -115,8 +133,7 @@ def choose_arrangement(
     """
     is_far = max(num_blocks) > 1
     order = order or ("colours" if is_far else "outward")
-    if order not in RANKS:
-        raise ValueError(f"order is {order!r}, expected one of: {', '.join(RANKS)}")
+    find_rank(order)
     if overlap is None:
         overlap = 0.25 if order == "colours" else 0.5
     return Arrangement(order, overlap, free_blocks or ("all" if is_far else "none"))
@@ -273,7 +290,7 @@ class SceneBlock:
         latent: (c, h, w) latent of the whole block.
         datum_m: Height of the block's frame above the frame of block (0, 0) (metres).
         known_ground: Fraction of the known pixels that have ground; 1 if the block had no known pixels. The paper's
-            outpainting fails if this fraction is near 0. Below HARDLY_KNOWN, blocks ignore their surroundings.
+            outpainting fails if this fraction is near 0. Below MIN_KNOWN_GROUND, blocks ignore their surroundings.
     """
 
     scene: Scene
@@ -308,7 +325,9 @@ class BlockCondition:
     @cached_property
     def new_pixels(self) -> np.ndarray:
         """(rows, cols) bool mask of the pixels to generate."""
-        return self.known.grid.upsample_cells(self.mask[-1].cpu().numpy() > 0)  # Sketched ground is new, too.
+        return self.known.grid.upsample_cells(
+            self.mask[-1].cpu().numpy() > 0
+        )  # An object channel: sketched ground is decoded, too.
 
 
 @dataclass(frozen=True)
@@ -683,7 +702,7 @@ def generate_blocks(
     as_paper = mode == "paper"
     labels = [label if isinstance(label, str) else label[index] for index in indices]
     keys = [(scene_index, *index) for index in indices]
-    alone = [not as_paper and (c.is_empty or c.known_ground < HARDLY_KNOWN) for c in conditions]
+    alone = [not as_paper and (c.is_empty or c.known_ground < MIN_KNOWN_GROUND) for c in conditions]
     latents, masks = (torch.stack(values) for values in zip(*((c.latent, c.mask) for c in conditions), strict=True))
     repaint = model.resolve_inpainting(repaint)
     masks[alone] = 1.0
@@ -693,12 +712,12 @@ def generate_blocks(
             continue
         names, chosen_keys, options = [labels[k] for k in chosen], [keys[k] for k in chosen], repaint
         if new and isinstance(repaint, RePaintConfig):
-            if not model.uses_ddpm:  # With DDPM, fewer steps than the model's would lose objects.
+            if not model.uses_ddpm:  # Few steps of DDPM would lose objects.
                 latents[chosen] = model.sample_latents(
                     names, seed, chosen_keys, None, guidance_scale, callback_on_step_end, purpose=OUTPAINT
                 )
                 continue
-            options = replace(repaint, resamplings=1, pseudoinverse_guidance=0.0)  # Without effect on such blocks.
+            options = replace(repaint, resamplings=1, pseudoinverse_guidance=0.0)  # They need a known part.
         condition = InpaintCondition(latents[chosen], masks[chosen])
         latents[chosen] = model.inpaint_latents(
             condition, names, seed, chosen_keys, options, guidance_scale, callback_on_step_end, OUTPAINT

@@ -7,10 +7,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 NUM_UNIFORM = 13  # Random numbers per sample that `make_training_masks` needs.
-NOTHING, STRIPS = 0.35, 0.45  # Shares of samples without a known region, and with known strips; the others have a hole.
-SIDE = 0.6  # Probability that a strip along one side is known.
-ONE_CONTENT = 0.1  # Shares of samples that also know all of the ground, and all objects.
-BAND = 0.15  # Share of samples that also know the ground of a straight band, such as a sketched road.
+# Shares of samples without a known strip or rectangle, and with known strips. In the others, everything outside of a
+# rectangle is known.
+SHARE_UNKNOWN, SHARE_STRIPS = 0.35, 0.45
+SIDE_PROBABILITY = 0.6  # Probability that a strip along one side is known.
+SHARE_ONE_CONTENT = 0.1  # Shares of samples that also know all of the ground, and all objects.
+SHARE_BAND = 0.15  # Share of samples that also know the ground of a straight band, such as a sketched road.
 BAND_CELLS = 3.0, 9.0  # Width of a band.
 
 
@@ -34,8 +36,8 @@ def make_training_masks(
     """
     kind, sides, corners, content, line = uniform.split([1, 4, 4, 1, 3], dim=1)
     cell = torch.arange(size, device=uniform.device)
-    # A number below SIDE determines the width of the strip, from 1 cell to half of the cells.
-    width = torch.where(sides < SIDE, (sides / SIDE * (size // 2)).long() + 1, 0)
+    # A number below SIDE_PROBABILITY determines the width of the strip, from 1 cell to half of the cells.
+    width = torch.where(sides < SIDE_PROBABILITY, (sides / SIDE_PROBABILITY * (size // 2)).long() + 1, 0)
     first, last = cell < width[:, [0, 2], None], cell >= size - width[:, [1, 3], None]
     rows, cols = (first | last).unbind(1)
     strips = rows[:, :, None] | cols[:, None, :]
@@ -43,15 +45,15 @@ def make_training_masks(
     inside_rows, inside_cols = ((cell >= low[:, :, None]) & (cell < high[:, :, None])).unbind(1)
     outside = ~(inside_rows[:, :, None] & inside_cols[:, None, :])
     kind = kind[:, :, None]
-    known = torch.where(kind < NOTHING, False, torch.where(kind < NOTHING + STRIPS, strips, outside))
-    whole_ground, whole_objects = content < ONE_CONTENT, content > 1 - ONE_CONTENT
+    known = torch.where(kind < SHARE_UNKNOWN, False, torch.where(kind < SHARE_UNKNOWN + SHARE_STRIPS, strips, outside))
+    whole_ground, whole_objects = content < SHARE_ONE_CONTENT, content > 1 - SHARE_ONE_CONTENT
     direction = torch.pi * line[:, 1]
     axis = (cell + 0.5) / size - 0.5
     distance = axis[:, None] * direction.cos()[:, None, None] + axis * direction.sin()[:, None, None]
-    low_cells, high_cells = BAND_CELLS  # A number below BAND determines the width of the band.
-    width_cells = low_cells + (high_cells - low_cells) * line[:, 0] / BAND
+    low_cells, high_cells = BAND_CELLS  # A number below SHARE_BAND determines the width of the band.
+    width_cells = low_cells + (high_cells - low_cells) * line[:, 0] / SHARE_BAND
     is_near = (distance - (line[:, 2] - 0.5)[:, None, None]).abs() * size < width_cells[:, None, None] / 2
-    band = is_near & (line[:, :1, None] < BAND)
+    band = is_near & (line[:, :1, None] < SHARE_BAND)
     ground, objects = known | band | whole_ground[:, :, None], known | whole_objects[:, :, None]
     half = channels // 2
     parts = [ground[:, None].expand(-1, half, -1, -1), objects[:, None].expand(-1, channels - half, -1, -1)]

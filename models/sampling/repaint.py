@@ -156,7 +156,7 @@ def choose_inpainting(way: str | None, reads_known: bool, is_of_paper: bool) -> 
     way = way or ("trained" if reads_known else "repaint" if is_of_paper else "guided")
     if way == "trained" and not reads_known:
         raise ValueError(
-            "this model is no inpainting model; use guided or repaint, or train it with train_dit.py --inpainting"
+            "this model is no inpainting model; use guided or repaint, or a model of train_dit.py --inpainting"
         )
     configs = {"trained": TrainedInpainting(), "guided": RePaintConfig.guided(), "repaint": RePaintConfig()}
     if way not in configs:

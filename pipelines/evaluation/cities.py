@@ -45,7 +45,7 @@ from pipelines.schema.tables import Shard
 
 CENTER_M = (WINDOW_M / 2, 0.0)  # Centre of the first scene of a city, in the frame of the city.
 SPLIT = "windows"
-FINE_CELLS = 1024  # A block in finer cells than those of any model, because records do not hold the size of the latent.
+FINE_CELLS = 1024  # Cells per block for locating seams: records do not hold the latent size, which is smaller.
 OVERVIEW_PX = 768
 REFERENCE, CEILING = "reference", "ceiling"
 TOWN_SEEDS_START = 2_000_000  # Towns of the ceiling have other seeds than those of datasets.
@@ -61,7 +61,7 @@ class CityResult:
         city: Scene id.
         rows: One dictionary per window: ahead, left, ring, direction, kept and QUANTITIES.
         angles_m: (n, 18) length of centrelines by direction, per window (m).
-        city_blocks_m2: Areas of blocks (m^2).
+        city_blocks_m2: Areas of the city blocks (m^2).
         connectivity: Share of road pixels in the largest connected part.
         area_m2: Area of the city (m^2).
         seams: Record (4, 2, 2) of the seams of each ring; empty if no seams are known.
@@ -125,7 +125,7 @@ class CityRequest:
         traffic: Whether to simulate traffic with SUMO.
         label: Requested densities of vegetation and vehicles; None: any. Windows of a procedural town are kept only if
             they have these densities.
-        block_labels: Labels of the blocks, of which each window has that of the nearest block; None: `label`.
+        block_labels: Labels of the blocks; each window has the label of the nearest block. None: all have `label`.
     """
 
     side: str
@@ -168,7 +168,7 @@ def find_seams_m(block_grid: BlockGrid, cell_m: float) -> tuple[tuple[float, ...
 
 
 class RunRecord(NamedTuple):
-    """What the record of a run of jobs/outpaint_scenes.py says about its cities.
+    """Options of a run of jobs/outpaint_scenes.py, from its record.
 
     Attributes:
         label: Requested densities of vegetation and vehicles; None: unknown, or the run took the label of each scene.
@@ -193,7 +193,7 @@ def read_run_record(root: str, source: str) -> RunRecord:
         source: Source of the run, such as generated-outpainted.
 
     Returns:
-        What the record says; nothing is known without a record.
+        The options; defaults without a record.
     """
     path = storage.join_uri(root, f"{source}.json")
     options = storage.read_json(path) if storage.exists(path) else {}
@@ -410,7 +410,10 @@ def select_reference(dataset: Dataset, split: str, label: Label, limit: int) -> 
     if any(free for *_, free in found):
         found = [entry for entry in found if entry[2]]
     if not found:
-        raise ValueError(f"{dataset.root}: no scene of split {split} has the densities {label[0]}, {label[1]}")
+        wanted = "-".join(part or ANY for part in label)
+        raise ValueError(
+            f"{dataset.root}: split {split} has no scene with label {wanted}; choose another --label or --real-split"
+        )
     parts: dict[Shard, list[int]] = {}
     for at in select_evenly(len(found), min(limit, len(found))):
         shard, row, _ = found[at]

@@ -1,4 +1,4 @@
-"""Render a city of tiles as an HTML page that loads the tiles near the camera.
+"""Render a city of tiles as an HTML page that loads the tiles near the point at which the camera looks.
 
 The page needs no server and no installation: it opens as a file. Tiles are scripts in the directory `tiles` next to it,
 and so are their views from afar, which the page shows where no tile is loaded.
@@ -18,7 +18,7 @@ from pipelines.rendering.render import render_bev
 from pipelines.reporting.gallery_page import read_script
 from pipelines.reporting.report_style import STYLE
 
-MAX_REACH_M = 600.0  # Tiles farther from the centre of the view are shown as pictures on coarse ground.
+MAX_REACH_M = 600.0  # Greatest distance from this point up to which tiles are loaded.
 OVERVIEW_PIXEL_M = 2.0  # Side of a pixel of these pictures.
 
 

@@ -1,7 +1,8 @@
-// The city page shows the tiles near the camera in 3D. pipelines/reporting/city_page.py writes its data and the tiles.
+// The city page shows the tiles near the point at which the camera looks in 3D, and pictures of the others.
+// pipelines/reporting/city_page.py writes its data and the tiles.
 //
 // A tile is a script, because pages that are opened as files cannot fetch other files. Each script calls tile(name,
-// content), where the content is a scene of pipelines/io/web_export.py as JSON, packed with gzip and base64.
+// content) or overview(name, content), where the content is a scene of pipelines/io/web_export.py as JSON, packed with gzip and base64.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const viewer = new Viewer(document.getElementById("view"));
@@ -12,7 +13,7 @@ let flying = false, last = 0;
 viewer.camera = { target: [...data.start_m, 0], distance: 180, azimuth: Math.PI, elevation: 0.6 };
 viewer.onmove = () => { viewer.focus = { middle: [...viewer.camera.target], reach: reach() }; choose(); };
 
-// Return the distance up to which tiles are shown (m).
+// Return the distance up to which tiles are loaded (m).
 function reach() { return Math.min(data.max_reach_m, Math.max(150, 2 * viewer.camera.distance)); }
 
 // Return the horizontal distance between the target of the camera and a tile (m).
@@ -56,7 +57,7 @@ window.tile = async (name, content) => {
   showFar(tile);
 };
 
-// Each tile also has a view from afar, which is shown while the tile is not.
+// Each tile also has a picture on coarse ground, which is shown until the tile is loaded.
 window.overview = async (name, content) => {
   const tile = tiles.get(name);
   tile.far = await unpack(`${name}-far`, content);
@@ -75,7 +76,7 @@ async function showFar(tile) {
   viewer.draw();
 }
 
-for (const tile of tiles.values()) load(`${tile.name}-far`, () => {});  // Pages of earlier versions have no such files.
+for (const tile of tiles.values()) load(`${tile.name}-far`, () => {});  // A missing picture is no error.
 
 // Keys move the camera: W, A, S, D or arrows; Q and E turn it. The button flies along the view and turns at the border.
 addEventListener("keydown", (event) => { keys.add(event.key.toLowerCase()); step(0); });

@@ -23,7 +23,7 @@ from models.sampling.diffusion import (
     sample,
     with_known,
 )
-from models.sampling.known_regions import BAND, NUM_UNIFORM, ONE_CONTENT, make_training_masks
+from models.sampling.known_regions import NUM_UNIFORM, SHARE_BAND, SHARE_ONE_CONTENT, make_training_masks
 from models.sampling.repaint import RePaintConfig, TrainedInpainting
 from models.training import DiffusionLossConfig, make_dit_settings, make_dit_trainer
 
@@ -61,7 +61,7 @@ def test_training_masks_have_the_known_regions_of_their_uses():
     known = 1 - make_training_masks(uniform, 6, SIZE)
     ground, objects = known[:, 0], known[:, -1]
     banded = ((ground == 1) & (objects == 0)).flatten(1).any(1) & (ground == 0).flatten(1).any(1)
-    assert float(banded.float().mean()) == pytest.approx(0.8 * BAND, abs=0.04)
+    assert float(banded.float().mean()) == pytest.approx(0.8 * SHARE_BAND, abs=0.04)
     assert torch.equal(known, torch.cat([ground[:, None].expand(-1, 3, -1, -1)] + 3 * [objects[:, None]], dim=1))
     shares = {
         "nothing": (known == 0).flatten(1).all(1),
@@ -71,8 +71,10 @@ def test_training_masks_have_the_known_regions_of_their_uses():
         "one side": (ground[:, 0] == 1).all(1) & (ground[:, -1] == 0).any(1),
     }
     share = {name: float(of.float().mean()) for name, of in shares.items()}
-    assert share["nothing"] == pytest.approx(0.35 * (1 - 2 * ONE_CONTENT) * (1 - BAND), abs=0.03)
-    assert all(0.8 * ONE_CONTENT < share[name] <= 1.1 * ONE_CONTENT for name in ("all ground", "all objects")), share
+    assert share["nothing"] == pytest.approx(0.35 * (1 - 2 * SHARE_ONE_CONTENT) * (1 - SHARE_BAND), abs=0.03)
+    assert all(
+        0.8 * SHARE_ONE_CONTENT < share[name] <= 1.1 * SHARE_ONE_CONTENT for name in ("all ground", "all objects")
+    ), share
     assert share["four sides"] > 0.1 and share["one side"] > 0.05
 
 
