@@ -60,8 +60,11 @@ class Config(RePaintOptions):
     ahead of or behind the given scene (off-street), or all generated blocks. Only models with labels such as
     low-medium-free distinguish both (default: none for one block on each side, all over longer distances)."""
     road_sketch: str = ""
-    """JSON file with roads that the generated blocks contain: a list of {"points_m": [[x, y], ...], "width_m": 7,
-    "sidewalk_m": 2}, in metres in the frame of the given scene, x ahead and y to the left."""
+    """File with roads that the generated blocks contain. JSON: a list of {"points_m": [[x, y], ...], "width_m": 7,
+    "sidewalk_m": 2}, in metres in the frame of the given scene, x ahead and y to the left. PNG: a map with white roads,
+    grey sidewalks and black elsewhere; ahead is up, and the middle of the picture is the middle of the given scene."""
+    sketch_pixel_m: float = 1.0
+    """Side of a pixel of a PNG file of --road-sketch in metres."""
     tile_m: float | None = None
     """Side of the tiles in metres, at least 64 (default: each result is written as one scene)."""
     neighbour_latents: Literal["reencode", "copy", "paper"] | None = None

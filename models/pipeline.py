@@ -27,7 +27,7 @@ from models.composition.extend import Side, extend_scene
 from models.composition.generator import StepCallback
 from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
 from models.composition.outpaint import BlockIndex, choose_arrangement, label_blocks, outpaint_scene
-from models.composition.road_sketch import SketchedRoad
+from models.composition.road_sketch import RoadMap, SketchedRoad
 from models.dit import DiT
 from models.execution import SamplingExecution
 from models.labels import FREE, find_label_index, split_label
@@ -963,7 +963,7 @@ class PrITTIPipeline:
         side: Side | None = None,
         order: str | None = None,
         free_blocks: str | None = None,
-        roads: Sequence[SketchedRoad] = (),
+        roads: Sequence[SketchedRoad | RoadMap] = (),
     ) -> Scene:
         """Extend a scene by generated blocks; the input content is unchanged (paper, supplement B.3).
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import fields
 from math import ceil
 
+import numpy as np
+from PIL import Image, UnidentifiedImageError
 from rich.progress import MofNCompleteColumn, Progress
 
 from jobs.implementation.checks import check_outpaint_scenes
@@ -15,11 +18,13 @@ from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import make_execution, make_inpainting_config, select_scenes
 from models.composition.outpaint import MIN_KNOWN_GROUND, Arrangement, choose_arrangement, label_blocks
-from models.composition.road_sketch import SketchedRoad
+from models.composition.road_sketch import RoadMap, SketchedRoad
 from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
 from pipelines.runtime import storage
 
 BLOCK_M = 64.0  # size of the scenes in every dataset (paper, Sec. 3.1)
+WHITE, GREY = 192, 64  # Lowest brightness of roads and of sidewalks in a map.
+MAX_MAP_PX = 20_000
 
 
 def arrange_blocks(config: Config) -> tuple[tuple[int, int, int, int], Arrangement]:
@@ -78,12 +83,14 @@ def read_labels_map(path: str, kind: str, counts: tuple[int, int, int, int]) -> 
     return tuple(tuple(row) for row in rows)
 
 
-def read_road_sketch(path: str) -> tuple[SketchedRoad, ...]:
-    """Return the roads of a sketch.
+def read_road_sketch(path: str, pixel_m: float) -> tuple[SketchedRoad | RoadMap, ...]:
+    """Return the roads of a sketch, a JSON or PNG file.
 
     Raises:
         ValueError: The file does not hold roads.
     """
+    if path.lower().endswith(".png"):
+        return (read_road_map(path, pixel_m),)
     roads = storage.read_json(make_absolute(path))
     names = {field.name for field in fields(SketchedRoad)}
     if not isinstance(roads, list) or not all(isinstance(road, dict) and road.keys() <= names for road in roads):
@@ -91,6 +98,25 @@ def read_road_sketch(path: str) -> tuple[SketchedRoad, ...]:
     try:
         return tuple(SketchedRoad(**road | {"points_m": tuple(map(tuple, road["points_m"]))}) for road in roads)
     except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"--road-sketch {path}: {error}") from error
+
+
+def read_road_map(path: str, pixel_m: float) -> RoadMap:
+    """Return the map of a PNG file: white roads, grey sidewalks, black elsewhere.
+
+    Raises:
+        ValueError: The file is no picture or too large, or shows no road.
+    """
+    try:
+        with Image.open(io.BytesIO(storage.read_bytes(make_absolute(path)))) as picture:
+            if max(picture.size) > MAX_MAP_PX:
+                raise ValueError(f"the picture has {picture.size} pixels, at most {MAX_MAP_PX} per side are allowed")
+            brightness = np.asarray(picture.convert("L"))
+        classes = np.where(brightness >= WHITE, 1, np.where(brightness >= GREY, 2, 0)).astype(np.uint8)
+        if not (classes == 1).any():
+            raise ValueError(f"the picture shows no road; roads are white (brightness of at least {WHITE})")
+        return RoadMap.from_classes(classes, pixel_m, (BLOCK_M / 2, 0.0))
+    except (UnidentifiedImageError, ValueError) as error:
         raise ValueError(f"--road-sketch {path}: {error}") from error
 
 
@@ -109,7 +135,7 @@ def outpaint(config: Config) -> list[str]:
         labels_map=read_labels_map(config.labels_map, read_label_kind(model), counts) if config.labels_map else None,
         free_blocks=arrangement.free_blocks,
         tile_m=config.tile_m,
-        roads=read_road_sketch(config.road_sketch) if config.road_sketch else (),
+        roads=read_road_sketch(config.road_sketch, config.sketch_pixel_m) if config.road_sketch else (),
         seed=config.seed,
         overlap=arrangement.overlap,
         mode=config.neighbour_latents,

@@ -17,7 +17,7 @@ from models.composition.outpaint import (
     find_rank,
     generate_blocks,
 )
-from models.composition.road_sketch import SketchedRoad
+from models.composition.road_sketch import RoadMap, SketchedRoad
 from models.sampling.repaint import InpaintingConfig
 from models.scene import Grid, Scene
 
@@ -61,7 +61,7 @@ class InfiniteScene:
         guidance_scale: float = 1.0,
         scene: Scene | None = None,
         scene_index: int = 0,
-        roads: Sequence[SketchedRoad] = (),
+        roads: Sequence[SketchedRoad | RoadMap] = (),
         order: str = "colours",
     ) -> None:
         self.model, self.label, self.seed, self.scene_index = model, label, seed, scene_index

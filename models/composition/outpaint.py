@@ -24,7 +24,7 @@ from torch import Tensor
 
 from models.composition.generator import SceneGenerator, StepCallback
 from models.composition.inpaint import find_region_cells
-from models.composition.road_sketch import SketchedRoad, add_sketched_ground, check_sketch
+from models.composition.road_sketch import RoadMap, SketchedRoad, add_sketched_ground, check_sketch
 from models.composition.seam_blending import extract_new_part, extrapolate_ground
 from models.labels import mark_free, require_labels
 from models.layout import LayoutSpec
@@ -404,7 +404,7 @@ class BlockComposer:
         spec: LayoutSpec,
         encode: EncodeScenes,
         level_m: float = 0.0,
-        roads: Sequence[SketchedRoad] = (),
+        roads: Sequence[SketchedRoad | RoadMap] = (),
     ) -> None:
         self.block_grid, self.spec, self.encode, self.level_m = block_grid, spec, encode, level_m
         self.roads = roads
@@ -593,7 +593,7 @@ class BlockComposer:
         return replace(like, grid=grid, height_m=height, occupied=occupied, ground_classes=classes, **primitives)
 
 
-def check_roads(roads: Sequence[SketchedRoad], scene: Scene, mode: str, has_split_latent: bool) -> None:
+def check_roads(roads: Sequence[SketchedRoad | RoadMap], scene: Scene, mode: str, has_split_latent: bool) -> None:
     """Check that outpainting can follow sketched roads.
 
     Args:
@@ -742,7 +742,7 @@ def outpaint_scene(
     repaint: InpaintingConfig | None,
     guidance_scale: float,
     callback_on_step_end: StepCallback | None,
-    roads: Sequence[SketchedRoad] = (),
+    roads: Sequence[SketchedRoad | RoadMap] = (),
 ) -> Scene:
     """Extend a scene on the model's grid by generated blocks on its four sides.
 

@@ -1,16 +1,23 @@
-"""Roads that a user draws, which outpainting takes as known ground."""
+"""Roads that outpainting takes as known ground: centrelines, or a map of all roads of an area."""
 
 from __future__ import annotations
 
+import base64
+import math
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from models.scene import Grid, Scene
 
 ROAD, SIDEWALK, TERRAIN = "road", "sidewalk", "terrain"
 SAMPLING_M = 0.5  # Distance between the points at which a sketch is compared with given ground.
+CORE_M = 1.5  # Pixels of a map that lie deeper inside of a road are compared with given ground.
+MAX_CONTRADICTION = 0.05  # Largest share of these pixels that may lie on other ground of the given scene.
 
 
 @dataclass(frozen=True)
@@ -59,8 +66,137 @@ class SketchedRoad:
             nearest = np.minimum(nearest, distance)
         return nearest
 
+    def draw(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the road on a grid.
 
-def draw_roads(roads: Sequence[SketchedRoad], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+        Args:
+            grid: Grid in the frame of the road.
+
+        Returns:
+            Masks (rows, cols) of the pixels of the road and of the road with its sidewalks.
+        """
+        reach, points = self.width_m / 2 + self.sidewalk_m, np.asarray(self.points_m, float)
+        low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
+        if low[0] > grid.front_m or high[0] < grid.back_m or low[1] > grid.left_m or high[1] < grid.right_m:
+            return np.zeros((grid.rows, grid.cols), bool), np.zeros((grid.rows, grid.cols), bool)
+        distance = self.measure_distance(grid.x_m()[:, None], grid.y_m()[None, :])
+        return distance <= self.width_m / 2, distance <= reach
+
+    def find_contradiction(self, scene: Scene) -> tuple[float, float, str] | None:
+        """Find a point of the centreline on given ground of another class.
+
+        Args:
+            scene: Given scene, in the frame of the road.
+
+        Returns:
+            x and y of the first such point (m), and the class of the ground; None if there is no such point.
+        """
+        points = np.asarray(self.points_m, float)
+        for start, stop in zip(points[:-1], points[1:], strict=True):
+            count = 2 + int(np.hypot(*(stop - start)) / SAMPLING_M)
+            x_m, y_m = (np.linspace(start[k], stop[k], count) for k in (0, 1))
+            inside = scene.grid.contains(x_m, y_m)
+            if found := _find_other_ground(scene, x_m[inside], y_m[inside])[:1]:
+                return found[0]
+        return None
+
+
+@dataclass(frozen=True)
+class RoadMap:
+    """All roads and sidewalks of an area, seen from above.
+
+    Attributes:
+        pixel_m: Side of a pixel (m).
+        center_m: x and y of the centre of the map (m, frame of block (0, 0)).
+        shape: Number of pixels along x and along y.
+        packed: Classes of the pixels, packed by `from_classes`.
+
+    Raises:
+        ValueError: A number is not finite or out of range, or the classes do not fit the shape.
+    """
+
+    pixel_m: float
+    center_m: tuple[float, float]
+    shape: tuple[int, int]
+    packed: str
+
+    def __post_init__(self) -> None:
+        if not 0.1 <= self.pixel_m <= 10.0 or not all(map(math.isfinite, self.center_m)):
+            raise ValueError(f"pixel_m is {self.pixel_m}, center_m is {self.center_m}; expected 0.1 to 10, and numbers")
+        if self.classes.max(initial=0) > 2:
+            raise ValueError("a map of roads has the classes 0 (other), 1 (road) and 2 (sidewalk) only")
+
+    @classmethod
+    def from_classes(cls, classes: np.ndarray, pixel_m: float, center_m: tuple[float, float] = (0.0, 0.0)) -> RoadMap:
+        """Make a map from the class of each pixel.
+
+        Args:
+            classes: (rows, cols) uint8: 0 other, 1 road, 2 sidewalk. The first row is farthest ahead, the first column
+                leftmost.
+            pixel_m: Side of a pixel (m).
+            center_m: x and y of the centre of the map (m, frame of block (0, 0)).
+
+        Returns:
+            The map.
+        """
+        packed = base64.b64encode(zlib.compress(np.ascontiguousarray(classes, np.uint8).tobytes(), 9)).decode()
+        rows, cols = classes.shape
+        return cls(pixel_m, center_m, (rows, cols), packed)
+
+    @cached_property
+    def classes(self) -> np.ndarray:
+        """(rows, cols) uint8 class of each pixel."""
+        return np.frombuffer(zlib.decompress(base64.b64decode(self.packed)), np.uint8).reshape(self.shape)
+
+    def draw(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the roads on a grid; borders run between the centres of pixels.
+
+        Args:
+            grid: Grid in the frame of block (0, 0).
+
+        Returns:
+            Masks (rows, cols) of the pixels of roads, and of roads and sidewalks.
+        """
+        rows, cols = self.shape
+        row = (self.center_m[0] - grid.x_m()) / self.pixel_m + (rows - 1) / 2
+        col = (self.center_m[1] - grid.y_m()) / self.pixel_m + (cols - 1) / 2
+        top, left = (max(0, math.floor(at.min())) for at in (row, col))
+        part = self.classes[top : math.ceil(row.max()) + 1, left : math.ceil(col.max()) + 1]
+        if not part.size:
+            return np.zeros((grid.rows, grid.cols), bool), np.zeros((grid.rows, grid.cols), bool)
+        at = np.meshgrid(row - top, col - left, indexing="ij")
+        road, paved = (
+            map_coordinates(mask.astype(np.float32), at, order=1, mode="constant") >= 0.5
+            for mask in (part == 1, part > 0)
+        )
+        return road, road | paved
+
+    def find_contradiction(self, scene: Scene) -> tuple[float, float, str] | None:
+        """Find given ground of another class inside of the roads.
+
+        Args:
+            scene: Given scene, in the frame of block (0, 0).
+
+        Returns:
+            x and y of such a point (m), and the class of the ground; None if at most MAX_CONTRADICTION of the pixels
+            deep inside of the roads lie on other ground.
+        """
+        road, _ = self.draw(scene.grid)
+        depth_m = np.asarray(distance_transform_edt(road)) * scene.grid.resolution_m
+        row, col = np.nonzero(depth_m > CORE_M)
+        found = _find_other_ground(scene, scene.grid.x_m()[row], scene.grid.y_m()[col])
+        return found[len(found) // 2] if len(found) > MAX_CONTRADICTION * len(row) else None
+
+
+def _find_other_ground(scene: Scene, x_m: np.ndarray, y_m: np.ndarray) -> list[tuple[float, float, str]]:
+    """Return x, y (m) and the ground class of those points at which a scene has ground other than road."""
+    classes = scene.surface()[1][scene.grid.pixel(x_m, y_m)]
+    is_other = (classes >= 0) & (classes != scene.ground_classes.index(ROAD) if ROAD in scene.ground_classes else True)
+    names = (scene.ground_classes[k] for k in classes[is_other])
+    return [(float(x), float(y), name) for x, y, name in zip(x_m[is_other], y_m[is_other], names, strict=True)]
+
+
+def draw_roads(roads: Sequence[SketchedRoad | RoadMap], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Draw roads on a grid.
 
     Args:
@@ -70,20 +206,20 @@ def draw_roads(roads: Sequence[SketchedRoad], grid: Grid) -> tuple[np.ndarray, n
     Returns:
         Masks (rows, cols) of the pixels of roads and of sidewalks, without common pixels.
     """
-    road, sidewalk = np.zeros((2, grid.rows, grid.cols), bool)
+    road, paved = np.zeros((2, grid.rows, grid.cols), bool)
     for one in roads:
-        reach, points = one.width_m / 2 + one.sidewalk_m, np.asarray(one.points_m, float)
-        low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
-        if low[0] > grid.front_m or high[0] < grid.back_m or low[1] > grid.left_m or high[1] < grid.right_m:
-            continue
-        distance = one.measure_distance(grid.x_m()[:, None], grid.y_m()[None, :])
-        road |= distance <= one.width_m / 2
-        sidewalk |= distance <= reach
-    return road, sidewalk & ~road
+        of_road, with_sidewalks = one.draw(grid)
+        road |= of_road
+        paved |= with_sidewalks
+    return road, paved & ~road
 
 
 def add_sketched_ground(
-    scene: Scene, roads: Sequence[SketchedRoad], where: np.ndarray, offset_m: tuple[float, float], level_m: float
+    scene: Scene,
+    roads: Sequence[SketchedRoad | RoadMap],
+    where: np.ndarray,
+    offset_m: tuple[float, float],
+    level_m: float,
 ) -> tuple[Scene, np.ndarray]:
     """Replace ground by sketched roads.
 
@@ -121,7 +257,7 @@ def add_sketched_ground(
     return replace(scene, occupied=occupied, height_m=height_m), drawn
 
 
-def check_sketch(roads: Sequence[SketchedRoad], scene: Scene) -> None:
+def check_sketch(roads: Sequence[SketchedRoad | RoadMap], scene: Scene) -> None:
     """Check that roads do not contradict the ground of the given scene.
 
     Args:
@@ -129,21 +265,12 @@ def check_sketch(roads: Sequence[SketchedRoad], scene: Scene) -> None:
         scene: Given scene.
 
     Raises:
-        ValueError: A centreline runs over ground of another class. The message states where.
+        ValueError: A road runs over ground of another class. The message states where.
     """
-    _, classes = scene.surface()
     for number, one in enumerate(roads, start=1):
-        points = np.asarray(one.points_m, float)
-        for start, stop in zip(points[:-1], points[1:], strict=True):
-            count = 2 + int(np.hypot(*(stop - start)) / SAMPLING_M)
-            x_m, y_m = (np.linspace(start[k], stop[k], count) for k in (0, 1))
-            inside = scene.grid.contains(x_m, y_m)
-            row, col = scene.grid.pixel(x_m[inside], y_m[inside])
-            for k, (i, j) in enumerate(zip(row, col, strict=True)):
-                found = int(classes[i, j])
-                if found >= 0 and scene.ground_classes[found] != ROAD:
-                    raise ValueError(
-                        f"road {number} of the sketch runs over {scene.ground_classes[found]} of scene"
-                        f" {scene.scene_id} at ({x_m[inside][k]:.1f}, {y_m[inside][k]:.1f}) m; start the road on a road"
-                        " of the scene, or outside of the scene"
-                    )
+        if found := one.find_contradiction(scene):
+            x_m, y_m, name = found
+            raise ValueError(
+                f"road {number} of the sketch runs over {name} of scene {scene.scene_id} at ({x_m:.1f}, {y_m:.1f}) m;"
+                " start the road on a road of the scene, or outside of the scene"
+            )

@@ -26,7 +26,7 @@ from models.composition.outpaint import (
     generate_blocks,
     label_blocks,
 )
-from models.composition.road_sketch import SketchedRoad
+from models.composition.road_sketch import RoadMap, SketchedRoad
 from models.execution import SamplingExecution
 from models.sampling.repaint import InpaintingConfig
 from models.scene import UNSET, Scene
@@ -87,7 +87,7 @@ class OutpaintRequest(Request):
     labels_map: tuple[tuple[str, ...], ...] | None = None
     free_blocks: str = "none"
     tile_m: float | None = None
-    roads: tuple[SketchedRoad, ...] = ()
+    roads: tuple[SketchedRoad | RoadMap, ...] = ()
 
     def scene_id(self, number: int) -> str:
         """Return the id of an extended scene.

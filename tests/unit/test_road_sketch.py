@@ -1,14 +1,18 @@
 """Tests of sketched roads: geometry, given ground, and the known part of blocks."""
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import torch
 from helpers import random_scene, small_spec, tiny_pipeline
+from PIL import Image
+from scipy.ndimage import distance_transform_edt
 
+from jobs.implementation.outpaint_scenes import read_road_sketch
 from models.composition.outpaint import BlockComposer, BlockGrid, SceneBlock, check_roads
-from models.composition.road_sketch import SketchedRoad, add_sketched_ground, check_sketch, draw_roads
+from models.composition.road_sketch import RoadMap, SketchedRoad, add_sketched_ground, check_sketch, draw_roads
 from models.layout import LayoutSpec
 from models.pipeline import PrITTIPipeline
 from models.scene import KITTI_GROUND_CLASSES, Grid
@@ -63,6 +67,55 @@ def test_sketch_must_not_contradict_given_ground():
     check_sketch([SketchedRoad(((-80.0, 50.0), (200.0, 50.0)))], street)  # It does not touch the scene.
     with pytest.raises(ValueError, match=r"road 2 of the sketch runs over terrain of scene test-0000 at \(40"):
         check_sketch([SketchedRoad(((64.0, 0.0), (90.0, 0.0))), SketchedRoad(((40.0, 20.0), (90.0, 20.0)))], street)
+
+
+def test_map_of_roads_draws_the_roads_it_was_drawn_from():
+    road = SketchedRoad(((-100.0, -30.0), (90.0, 40.0), (160.0, 40.0)), width_m=9.0, sidewalk_m=3.0)
+    area = Grid(rows=480, cols=320, resolution_m=1.0, front_m=32 + 240.0, left_m=160.0)
+    of_road, sidewalk = draw_roads([road], area)
+    made = RoadMap.from_classes(of_road + 2 * sidewalk.astype(np.uint8), 1.0, (32.0, 0.0))
+    for x_m, y_m in ((0.0, 0.0), (60.0, 30.0), (-96.0, -64.0), (230.0, 140.0), (900.0, 0.0)):
+        grid = replace(FINE, front_m=FINE.front_m + x_m, left_m=FINE.left_m + y_m)
+        for truth, found in zip(draw_roads([road], grid), draw_roads([made], grid), strict=True):
+            away_px = np.maximum(distance_transform_edt(truth), distance_transform_edt(~truth))
+            # A pixel of the map is four pixels of the grid long.
+            assert away_px[truth != found].max(initial=0) <= 3 and truth.any() == found.any()
+    assert draw_roads([made], FINE)[0].any() and not draw_roads([made], replace(FINE, front_m=-900.0))[1].any()
+    assert json.loads(json.dumps(asdict(made)))["packed"] == made.packed  # As in the record of a run.
+    assert (made.classes == of_road + 2 * sidewalk).all()
+    with pytest.raises(ValueError, match=r"pixel_m is 0\.0"):
+        RoadMap.from_classes(of_road.astype(np.uint8), 0.0)
+    with pytest.raises(ValueError, match="classes 0"):
+        RoadMap.from_classes(of_road * np.uint8(3), 1.0)
+
+
+def test_map_of_roads_must_not_contradict_given_ground():
+    street = make_street(FINE)  # Its road has a width of 8 m and lies along y = 0.
+    cols = np.arange(400) + np.zeros((400, 1))
+    for shift_m, name in ((0, None), (1, None), (20, "terrain")):
+        roads = np.abs(199.5 - cols - shift_m) < 4
+        made = RoadMap.from_classes(roads.astype(np.uint8), 1.0, (32.0, 0.0))
+        if name:
+            with pytest.raises(ValueError, match=rf"road 1 of the sketch runs over {name} of scene test-0000"):
+                check_sketch([made], street)
+        else:
+            check_sketch([made], street)
+
+
+def test_map_of_roads_is_read_from_a_picture(tmp_path):
+    picture = np.zeros((300, 200), np.uint8)
+    picture[:, 90:110], picture[:, 110:115] = 255, 128
+    Image.fromarray(picture).convert("RGB").save(tmp_path / "roads.png")
+    (made,) = read_road_sketch(str(tmp_path / "roads.png"), 0.5)
+    assert made.pixel_m == 0.5 and made.center_m == (32.0, 0.0)
+    road, sidewalk = draw_roads([made], FINE)
+    assert road[:, np.abs(FINE.y_m()) < 4.9].all() and not road[:, np.abs(FINE.y_m()) > 5.1].any()
+    assert sidewalk[:, np.abs(FINE.y_m() + 6.25) < 1].all()  # Right in the picture is right of the scene.
+    Image.fromarray(0 * picture).save(tmp_path / "dark.png")
+    (tmp_path / "text.png").write_text("no picture")
+    for name, message in (("dark.png", "shows no road"), ("text.png", "cannot identify image")):
+        with pytest.raises(ValueError, match=rf"--road-sketch .*{name}: .*{message}"):
+            read_road_sketch(str(tmp_path / name), 1.0)
 
 
 def test_sketched_ground_takes_the_height_of_its_surroundings():
