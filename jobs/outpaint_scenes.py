@@ -52,6 +52,9 @@ class Config(RePaintOptions):
     order: Literal["outward", "colours"] | None = None
     """Order of blocks: outward from the scene, as in the paper, or four groups of independent blocks (needs --overlap <
     0.5; default: outward for one block on each side, colours over longer distances, where outward drifts)."""
+    margin: float | None = None
+    """Width of the outermost part of a block that its neighbours generate again, as a share of the block size. It must
+    be less than half of --overlap (default: 0)."""
     labels_map: str = ""
     """JSON file with one list per row of blocks, farthest ahead first, each with one label per block, leftmost first;
     replaces --label."""

@@ -964,6 +964,7 @@ class PrITTIPipeline:
         order: str | None = None,
         free_blocks: str | None = None,
         roads: Sequence[SketchedRoad | RoadMap] = (),
+        margin: float | None = None,
     ) -> Scene:
         """Extend a scene by generated blocks; the input content is unchanged (paper, supplement B.3).
 
@@ -990,6 +991,8 @@ class PrITTIPipeline:
             free_blocks: Blocks that count as crops at any place and heading, instead of views of a vehicle: "none",
                 "off-street" or "all"; None: see `choose_arrangement`. Ignored if `label` is a mapping.
             roads: Roads that the generated blocks contain, in the frame of the scene; ignored with `side`.
+            margin: Width of the outermost part of a block that its neighbours generate again, as a fraction of a block;
+                None: see `choose_arrangement`.
 
         Returns:
             One scene that covers all blocks.
@@ -1004,7 +1007,7 @@ class PrITTIPipeline:
             share = 0.5 if overlap is None else overlap
             return extend_scene(self, scene, side, label, seed, share, repaint, guidance_scale, callback_on_step_end)
         self.require_grid(scene)
-        arrangement = choose_arrangement(num_blocks, order, overlap, free_blocks)
+        arrangement = choose_arrangement(num_blocks, order, overlap, free_blocks, margin)
         if isinstance(label, str):
             label = label_blocks(self.dit.config.label, label, num_blocks, arrangement.free_blocks)
         return outpaint_scene(

@@ -33,7 +33,7 @@ def arrange_blocks(config: Config) -> tuple[tuple[int, int, int, int], Arrangeme
     Raises:
         ValueError: A number is negative, or all numbers are 0.
     """
-    chosen = config.order, config.overlap, config.free_blocks
+    chosen = config.order, config.overlap, config.free_blocks, config.margin
     if config.extent_m is None:
         counts = config.blocks_ahead, config.blocks_behind, config.blocks_left, config.blocks_right
     else:
@@ -138,6 +138,7 @@ def outpaint(config: Config) -> list[str]:
         roads=read_road_sketch(config.road_sketch, config.sketch_pixel_m) if config.road_sketch else (),
         seed=config.seed,
         overlap=arrangement.overlap,
+        margin=arrangement.margin,
         mode=config.neighbour_latents,
         repaint=make_inpainting_config(config, model),
         execution=make_execution(config),

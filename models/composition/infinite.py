@@ -44,6 +44,7 @@ class InfiniteScene:
             channels for ground and objects.
         order: Order of the blocks, a key of RANKS. With "colours", each block depends on at most eight neighbours and
             on block (0, 0). With "outward", it depends on all blocks of a rectangle with block (0, 0).
+        margin: Width of the margin of blocks as a fraction of a block (`outpaint.BlockGrid`).
 
     Raises:
         ValueError: The order or the label is unknown, the overlap is 0.5 or more with "colours", or the model cannot
@@ -63,10 +64,13 @@ class InfiniteScene:
         scene_index: int = 0,
         roads: Sequence[SketchedRoad | RoadMap] = (),
         order: str = "colours",
+        margin: float = 0.0,
     ) -> None:
         self.model, self.label, self.seed, self.scene_index = model, label, seed, scene_index
         self.options: dict[str, Any] = {"mode": mode, "repaint": repaint, "guidance_scale": guidance_scale}
-        block_grid = BlockGrid.from_overlap(model.latent_shape[-1], overlap, rank=find_rank(order), num_blocks=None)
+        block_grid = BlockGrid.from_overlap(
+            model.latent_shape[-1], overlap, margin, rank=find_rank(order), num_blocks=None
+        )
         self.composer = BlockComposer(block_grid, model.spec, model.encode, roads=roads)
         self.blocks: dict[BlockIndex, SceneBlock] = {}
         self.scene = scene

@@ -5,9 +5,10 @@ rectangles of any size and unbounded grids. By default, the order, the overlap a
 from the paper (`choose_arrangement`, MODES).
 
 Block (i, j) lies i steps ahead of block (0, 0) and j steps to its left. A step is (1 - overlap) of a block. The rank of
-a block depends only on (i, j). A cell that several blocks cover is owned by the block with the lowest rank. Blocks of
-the same rank never own the same cell. The condition of a block consists of those of its cells that blocks of lower rank
-own. The result therefore does not depend on the time, the machine or the order of generation.
+a block depends only on (i, j). A cell that several blocks cover is owned by the block with the lowest rank. With a
+margin, blocks do not own their outermost cells where they have neighbours: a block sees only one side of these cells.
+Blocks of the same rank never own the same cell. The condition of a block consists of those of its cells that blocks of
+lower rank own. The result therefore does not depend on the time, the machine or the order of generation.
 """
 
 from __future__ import annotations
@@ -100,11 +101,13 @@ class Arrangement(NamedTuple):
         order: Order of the blocks, a key of RANKS.
         overlap: Overlap of neighbouring blocks as a fraction of a block.
         free_blocks: Blocks that count as crops at any place and heading, a key of FREE_BLOCKS.
+        margin: Width of the margin of blocks as a fraction of a block (`BlockGrid`).
     """
 
     order: str
     overlap: float
     free_blocks: str
+    margin: float = 0.0
 
 
 def choose_arrangement(
@@ -112,6 +115,7 @@ def choose_arrangement(
     order: str | None = None,
     overlap: float | None = None,
     free_blocks: str | None = None,
+    margin: float | None = None,
 ) -> Arrangement:
     """Return how blocks are arranged.
 
@@ -124,6 +128,7 @@ def choose_arrangement(
         order: Order of the blocks, a key of RANKS; None: the default.
         overlap: Overlap of neighbouring blocks; None: 0.25 for colours and 0.5 for outward.
         free_blocks: Blocks that count as crops at any place and heading, a key of FREE_BLOCKS; None: the default.
+        margin: Width of the margin of blocks as a fraction of a block; None: 0.
 
     Returns:
         The arrangement.
@@ -136,7 +141,7 @@ def choose_arrangement(
     find_rank(order)
     if overlap is None:
         overlap = 0.25 if order == "colours" else 0.5
-    return Arrangement(order, overlap, free_blocks or ("all" if is_far else "none"))
+    return Arrangement(order, overlap, free_blocks or ("all" if is_far else "none"), margin or 0.0)
 
 
 @dataclass(frozen=True)
@@ -148,34 +153,45 @@ class BlockGrid:
         step: Distance between neighbouring blocks in cells.
         rank: Function that returns the rank of a block; lower ranks are generated first.
         num_blocks: Number of blocks ahead of, behind, to the left of and to the right of block (0, 0). None: unbounded.
+        margin: Number of outermost cells that a block does not own on sides with a neighbour. Block (0, 0), whose
+            content may be given, owns all of its cells.
     """
 
     size: int
     step: int
     rank: Callable[[BlockIndex], int] = rank_outward
     num_blocks: tuple[int, int, int, int] | None = (1, 1, 1, 1)
+    margin: int = 0
 
     @classmethod
-    def from_overlap(cls, size: int, overlap: float, **options: Any) -> BlockGrid:
+    def from_overlap(cls, size: int, overlap: float, margin: float = 0.0, **options: Any) -> BlockGrid:
         """Make a block grid from the overlap of neighbouring blocks.
 
         Args:
             size: Side of a block in latent cells.
             overlap: Fraction of a block that overlaps its neighbour.
+            margin: Width of the margin as a fraction of a block.
             **options: Other fields of `BlockGrid`.
 
         Returns:
             The block grid.
 
         Raises:
-            ValueError: The overlap is not a whole number of cells, or blocks of the same rank would overlap.
+            ValueError: The overlap or the margin is not a whole number of cells, blocks of the same rank would overlap,
+                or the margin is half of the overlap or more.
         """
         step = round(size * (1 - overlap))
         if not 0 < step < size or abs(step - size * (1 - overlap)) > 1e-6:
             raise ValueError(
                 f"overlap {overlap} must lie between 0 and 1 and be a multiple of 1 / {size} (one latent cell)"
             )
-        grid = cls(size, step, **options)
+        cells = round(size * margin)
+        if not 0 <= 2 * cells < size - step or abs(cells - size * margin) > 1e-6:
+            raise ValueError(
+                f"the margin is {margin}, expected at least 0, less than half of the overlap {overlap}, and a multiple"
+                f" of 1 / {size} (one latent cell)"
+            )
+        grid = cls(size, step, margin=cells, **options)
         if grid.rank is rank_four_colors and 2 * step <= size:
             raise ValueError(
                 f"overlap is {overlap}, expected less than 0.5: otherwise, blocks of the same rank overlap"
@@ -249,8 +265,24 @@ class BlockGrid:
         )
         return rows, cols
 
-    def owned_cells(self, index: BlockIndex) -> np.ndarray:
-        """Return the cells of a block that no predecessor covers.
+    def _inner_cells(self, index: BlockIndex) -> np.ndarray:
+        """Return the (size, size) bool mask of the cells of a block that are not in its margin."""
+        inner = np.ones((self.size, self.size), bool)
+        if index == (0, 0):
+            return inner
+        (i, j), margin = index, self.margin
+        if self.contains((i + 1, j)):
+            inner[:margin] = False
+        if self.contains((i - 1, j)):
+            inner[self.size - margin :] = False
+        if self.contains((i, j + 1)):
+            inner[:, :margin] = False
+        if self.contains((i, j - 1)):
+            inner[:, self.size - margin :] = False
+        return inner
+
+    def new_cells(self, index: BlockIndex) -> np.ndarray:
+        """Return the cells of a block that no predecessor owns. The block generates them.
 
         Args:
             index: Index of the block.
@@ -258,10 +290,21 @@ class BlockGrid:
         Returns:
             (size, size) bool.
         """
-        owned = np.ones((self.size, self.size), bool)
+        new = np.ones((self.size, self.size), bool)
         for other in self.list_predecessors(index):
-            owned[self.overlap_cells(index, other)] = False
-        return owned
+            new[self.overlap_cells(index, other)] &= ~self._inner_cells(other)[self.overlap_cells(other, index)]
+        return new
+
+    def owned_cells(self, index: BlockIndex) -> np.ndarray:
+        """Return the cells that a block owns: its new cells without its margin.
+
+        Args:
+            index: Index of the block.
+
+        Returns:
+            (size, size) bool.
+        """
+        return self.new_cells(index) & self._inner_cells(index)
 
     def known_cells(self, index: BlockIndex) -> list[tuple[BlockIndex, np.ndarray]]:
         """Return the cells of a block that its predecessors own.
@@ -309,6 +352,7 @@ class BlockCondition:
         mask: (c, h, w); 1 marks values to generate, 0 marks values to keep.
         datum_m: Height of the block's frame above the frame of block (0, 0) (metres).
         known_ground: Fraction of the known pixels that have ground; 1 if there are no known pixels.
+        owned: (h, w) bool mask of the latent cells that the block owns.
     """
 
     known: Scene
@@ -316,6 +360,7 @@ class BlockCondition:
     mask: Tensor
     datum_m: float
     known_ground: float
+    owned: np.ndarray
 
     @property
     def is_empty(self) -> bool:
@@ -525,11 +570,11 @@ class BlockComposer:
         grid = self.spec.grid
         scenes = [self.to_block_frame(index, other, block) for other, block, _ in parts]
         known = merge_scenes(scenes, [grid.upsample_cells(cells) for *_, cells in parts], empty) if parts else empty
-        owned = self.block_grid.owned_cells(index)
-        mask = torch.from_numpy(owned)
+        new_cells = self.block_grid.new_cells(index)
+        mask = torch.from_numpy(new_cells)
         datum_m = find_ground_height(known, 0.0, 0.0) - self.level_m if parts and mode == "reencode" else 0.0
         known = known.translate(0, 0, -datum_m)
-        new = grid.upsample_cells(owned)
+        new = grid.upsample_cells(new_cells)
         shown, offset_m = extrapolate_ground(known, new), (index[0] * self.step_m, index[1] * self.step_m)
         shown, drawn = add_sketched_ground(shown, self.roads, new, offset_m, self.level_m)
         latent = self.encode([shown])[0]
@@ -543,10 +588,10 @@ class BlockComposer:
         known_ground = float(seen.mean()) if len(seen) else 1.0
         mask = mask.to(latent).expand_as(latent)
         if drawn.any():  # The first half of the channels belongs to the ground.
-            sketched = ~find_region_cells(~drawn, len(owned))
+            sketched = ~find_region_cells(~drawn, len(new_cells))
             mask = mask.clone()
             mask[: len(mask) // 2, torch.from_numpy(sketched)] = 0.0
-        return BlockCondition(known, latent, mask, datum_m, known_ground)
+        return BlockCondition(known, latent, mask, datum_m, known_ground, self.block_grid.owned_cells(index))
 
     def finish_block(
         self, condition: BlockCondition, latent: Tensor, generated: Scene, blend: bool = True
@@ -563,6 +608,7 @@ class BlockComposer:
             The block, which contains only the cells that it owns.
         """
         own = extract_new_part(generated, condition.known, condition.new_pixels, blend)
+        own = merge_scenes([own], [own.grid.upsample_cells(condition.owned)], own)
         return SceneBlock(own, latent, condition.datum_m, condition.known_ground)
 
     def stitch(self, blocks: Mapping[BlockIndex, SceneBlock], like: Scene, grid: Grid | None = None) -> Scene:
@@ -768,7 +814,11 @@ def outpaint_scene(
     """
     check_roads(roads, scene, mode, model.has_split_latent)
     block_grid = BlockGrid.from_overlap(
-        model.latent_shape[-1], arrangement.overlap, rank=RANKS[arrangement.order], num_blocks=num_blocks
+        model.latent_shape[-1],
+        arrangement.overlap,
+        arrangement.margin,
+        rank=RANKS[arrangement.order],
+        num_blocks=num_blocks,
     )
     composer = BlockComposer(block_grid, model.spec, model.encode, find_ground_height(scene, 0.0, 0.0), roads)
     blocks = {(0, 0): SceneBlock(scene, model.encode([scene])[0])}

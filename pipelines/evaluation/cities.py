@@ -153,17 +153,14 @@ def find_seams_m(block_grid: BlockGrid, cell_m: float) -> tuple[tuple[float, ...
     ahead, behind, left, right = block_grid.num_blocks or (0, 0, 0, 0)
     found = []
     for low, high, place in ((-behind, ahead, lambda k: (k, 0)), (-right, left, lambda k: (0, k))):
-        known = np.zeros(block_grid.step * (high - low) + block_grid.size, bool)
-        edges = set()
+        owner = np.full(block_grid.step * (high - low) + block_grid.size, low - 1)
         for k in sorted(range(low, high + 1), key=lambda k, place=place: block_grid.rank(place(k))):
-            start = (k - low) * block_grid.step
-            part = known[start : start + block_grid.size]
-            edges |= {start + int(at) + 1 for at in np.flatnonzero(np.diff(part.astype(int)))}
-            for edge in (start, start + block_grid.size):  # The new block ends exactly where known content starts.
-                if 0 < edge < len(known) and known[edge - 1] != known[edge]:
-                    edges.add(edge)
-            known[start : start + block_grid.size] = True
-        found.append(tuple((edge + low * block_grid.step) * cell_m for edge in sorted(edges)))
+            start, margin = (k - low) * block_grid.step, block_grid.margin if k else 0
+            first, last = start + margin * (k > low), start + block_grid.size - margin * (k < high)
+            part = owner[first:last]
+            part[part < low] = k
+        edges = np.flatnonzero(np.diff(owner)) + 1
+        found.append(tuple((int(edge) + low * block_grid.step) * cell_m for edge in edges))
     return found[0], tuple(y - WINDOW_M / 2 for y in found[1])
 
 
@@ -201,7 +198,11 @@ def read_run_record(root: str, source: str) -> RunRecord:
     if not {"overlap", "num_blocks", "order"} <= set(options):
         return RunRecord(label)
     grid = BlockGrid.from_overlap(
-        FINE_CELLS, options["overlap"], rank=RANKS[options["order"]], num_blocks=tuple(options["num_blocks"])
+        FINE_CELLS,
+        options["overlap"],
+        options.get("margin", 0.0),
+        rank=RANKS[options["order"]],
+        num_blocks=tuple(options["num_blocks"]),
     )
     ahead, behind, left, right = options["num_blocks"]
     step_m = WINDOW_M * (1 - options["overlap"])

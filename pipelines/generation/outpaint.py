@@ -61,6 +61,7 @@ class OutpaintRequest(Request):
         tile_m: Side (m) of the tiles in which a scene is written. No step holds a whole scene in memory. None: each
             scene is written as a whole.
         roads: Sketched roads in the frame of each scene, which its blocks contain.
+        margin: Width of the margin of blocks as a fraction of a block (`BlockGrid`).
         seed: Seed of the noise.
         overlap: Overlap of neighbouring blocks as a fraction of a block.
         mode: Outpainting mode of `generate_blocks`. None: the mode that the pipeline stores.
@@ -88,6 +89,7 @@ class OutpaintRequest(Request):
     free_blocks: str = "none"
     tile_m: float | None = None
     roads: tuple[SketchedRoad | RoadMap, ...] = ()
+    margin: float = 0.0
 
     def scene_id(self, number: int) -> str:
         """Return the id of an extended scene.
@@ -123,7 +125,9 @@ class OutpaintRequest(Request):
         Raises:
             ValueError: The overlap is not a whole number of cells.
         """
-        return BlockGrid.from_overlap(size, self.overlap, rank=RANKS[self.order], num_blocks=self.num_blocks)
+        return BlockGrid.from_overlap(
+            size, self.overlap, self.margin, rank=RANKS[self.order], num_blocks=self.num_blocks
+        )
 
 
 @dataclass(frozen=True)

@@ -151,7 +151,7 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
     # Records written by earlier versions lack these options.
     execution = {"precision": "fp32", "compile": False, "decode_batch_size": 1}
     defaults = {"constraints": False, "pag_scale": 0.0, "repair": False, "execution": execution}
-    defaults |= {"labels_map": None, "free_blocks": "none", "tile_m": None, "roads": ()}
+    defaults |= {"labels_map": None, "free_blocks": "none", "tile_m": None, "roads": (), "margin": 0.0}
     options = {name: value for name, value in options.items() if name not in defaults or value != defaults[name]}
     # RePaint uses the noise scaling only if eta is not 1.
     if options.get("repaint", {}).get("known_guidance_scale") == 1:

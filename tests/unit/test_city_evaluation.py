@@ -34,6 +34,8 @@ def test_seams_lie_where_new_blocks_meet_known_content():
     colours = BlockGrid.from_overlap(32, 0.25, rank=RANKS["colours"], num_blocks=(2, 0, 0, 0))
     # Blocks 0 and 2 (x from 96 to 160 m) come first; block 1 (48 to 112 m) fills the gap between 64 and 96 m.
     assert find_seams_m(colours, 2.0) == ((64.0, 96.0), ())
+    inner = BlockGrid.from_overlap(32, 0.25, 0.0625, rank=RANKS["colours"], num_blocks=(2, 0, 0, 0))
+    assert find_seams_m(inner, 2.0) == ((64.0, 100.0), ())  # Block 2 does not own its first 4 m; block 0 owns all.
     assert find_seams_m(BlockGrid(32, 16, num_blocks=(0, 0, 0, 0)), 2.0) == ((), ())
 
 

@@ -63,14 +63,18 @@ def iterate_block_grids():
     rectangles = [(1, 1, 1, 1), (3, 0, 2, 1), (0, 4, 0, 0)]
     for last, overlap in product(rectangles, (0.125, 0.25, 0.5, 0.75)):
         yield BlockGrid.from_overlap(8, overlap, num_blocks=last)
+        if overlap > 0.25:
+            yield BlockGrid.from_overlap(8, overlap, 0.125, num_blocks=last)
     for overlap in (0.125, 0.25, 0.375):
         yield BlockGrid.from_overlap(8, overlap, rank=rank_four_colors, num_blocks=None)
+    yield BlockGrid.from_overlap(8, 0.375, 0.125, rank=rank_four_colors, num_blocks=None)
+    yield BlockGrid.from_overlap(8, 0.375, 0.125, rank=rank_four_colors, num_blocks=(2, 1, 1, 2))
 
 
 @pytest.mark.parametrize(
     "block_grid",
     iterate_block_grids(),
-    ids=lambda block_grid: f"{block_grid.rank.__name__}-{block_grid.step}-{block_grid.num_blocks}",
+    ids=lambda block_grid: f"{block_grid.rank.__name__}-{block_grid.step}-{block_grid.num_blocks}-{block_grid.margin}",
 )
 def test_block_grid_cells_have_one_owner_known_to_later_blocks(block_grid):
     indices = block_grid.indices() if block_grid.num_blocks else list(product(range(-3, 4), repeat=2))
@@ -80,6 +84,11 @@ def test_block_grid_cells_have_one_owner_known_to_later_blocks(block_grid):
             # World cells: rows increase backward, columns increase to the right.
             owners.setdefault((row - index[0] * block_grid.step, col - index[1] * block_grid.step), []).append(index)
     assert all(len(found) == 1 for found in owners.values())
+    if block_grid.num_blocks:  # The blocks together own each cell that they cover.
+        ahead, behind, left, right = block_grid.num_blocks
+        sides = 8 + (ahead + behind) * block_grid.step, 8 + (left + right) * block_grid.step
+        assert len(owners) == sides[0] * sides[1]
+    assert block_grid.owned_cells((0, 0)).all()
     for index in indices:
         known = np.zeros((8, 8), bool)
         for other, cells in block_grid.known_cells(index):
@@ -88,7 +97,8 @@ def test_block_grid_cells_have_one_owner_known_to_later_blocks(block_grid):
             for row, col in np.argwhere(cells).tolist():
                 at = (row - index[0] * block_grid.step, col - index[1] * block_grid.step)
                 assert owners.get(at, [other]) == [other]
-        assert np.array_equal(known, ~block_grid.owned_cells(index))
+        assert np.array_equal(known, ~block_grid.new_cells(index))
+        assert not (block_grid.owned_cells(index) & known).any()
 
 
 def test_block_grid_fronts_are_independent():
