@@ -208,10 +208,10 @@ def test_region_is_inpainted_around_known_objects(pipeline):
 
 
 def test_arrangement_changes_with_the_distance():
-    assert choose_arrangement((1, 1, 1, 1)) == ("outward", 0.5, "none")
-    assert choose_arrangement((2, 0, 0, 0)) == ("colours", 0.25, "all")
-    assert choose_arrangement((2, 0, 0, 0), "outward") == ("outward", 0.5, "all")
-    assert choose_arrangement((1, 1, 1, 1), overlap=0.25, free_blocks="all") == ("outward", 0.25, "all")
+    assert choose_arrangement((1, 1, 1, 1)) == ("outward", 0.5, "none", 0.0)
+    assert choose_arrangement((2, 0, 0, 0)) == ("colours", 0.25, "all", 0.0)
+    assert choose_arrangement((2, 0, 0, 0), "outward", margin=0.1) == ("outward", 0.5, "all", 0.1)
+    assert choose_arrangement((1, 1, 1, 1), overlap=0.25, free_blocks="all") == ("outward", 0.25, "all", 0.0)
     with pytest.raises(ValueError, match="order is 'spiral', expected one of: outward, colours"):
         choose_arrangement((1, 1, 1, 1), "spiral")
 
