@@ -36,13 +36,14 @@ def arrange_blocks(config: Config) -> tuple[tuple[int, int, int, int], Arrangeme
     chosen = config.order, config.overlap, config.free_blocks, config.margin
     if config.extent_m is None:
         counts = config.blocks_ahead, config.blocks_behind, config.blocks_left, config.blocks_right
+        arrangement = choose_arrangement(counts, *chosen)
     else:
         is_far = max(config.extent_m) > 2 * BLOCK_M  # The paper's blocks on each side add half a block.
-        overlap = choose_arrangement((2 if is_far else 1, 0, 0, 0), *chosen).overlap
-        step_m = BLOCK_M * (1 - overlap)
+        arrangement = choose_arrangement((2 if is_far else 1, 0, 0, 0), *chosen)
+        step_m = BLOCK_M * (1 - arrangement.overlap)
         if not 0 < step_m <= BLOCK_M or min(config.extent_m) < BLOCK_M:
             raise ValueError(
-                f"--extent-m is {config.extent_m}, --overlap is {overlap}: "
+                f"--extent-m is {config.extent_m}, --overlap is {arrangement.overlap}: "
                 f"expected an extent of at least {BLOCK_M} m and an overlap in [0, 1)"
             )
         sides = [ceil((extent - BLOCK_M) / 2 / step_m - 1e-9) for extent in config.extent_m]
@@ -52,7 +53,7 @@ def arrange_blocks(config: Config) -> tuple[tuple[int, int, int, int], Arrangeme
             f"--blocks-ahead, --blocks-behind, --blocks-left and --blocks-right are {counts}: "
             "expected numbers of at least 0, and at least one block"
         )
-    return counts, choose_arrangement(counts, *chosen)
+    return counts, arrangement
 
 
 def report_extent(config: Config, counts: tuple[int, int, int, int], overlap: float) -> None:

@@ -272,8 +272,6 @@ def check_tiles(directory, whole: Scene) -> None:
 
 @pytest.mark.slow  # Sampling has the same tests with one block per scene.
 def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_path):
-    from jobs.implementation.outpaint_scenes import arrange_blocks
-    from jobs.outpaint_scenes import Config
     from models.sampling.repaint import RePaintConfig
     from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
     from pipelines.schema.scene_subset import SceneSubset
@@ -328,17 +326,6 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
     (path,) = outpaint_scenes(request("outward", order="outward", num_blocks=(1, 0, 0, 0)), chosen)
     (outward,) = storage.read_parquet(path).to_pylist()[1:]
     assert outward["ahead"] == 1
-    assert arrange_blocks(Config(extent_m=(128.0, 65.0))) == ((1, 1, 1, 1), ("outward", 0.5, "none"))
-    assert arrange_blocks(Config(extent_m=(512.0, 128.0))) == ((5, 5, 1, 1), ("colours", 0.25, "all"))
-    far = arrange_blocks(Config(extent_m=(512.0, 128.0), order="outward", free_blocks="off-street"))
-    assert far == ((7, 7, 1, 1), ("outward", 0.5, "off-street"))
-    for wrong in (
-        Config(extent_m=(32.0, 64.0)),
-        Config(blocks_ahead=0, blocks_behind=0, blocks_left=0, blocks_right=0),
-        Config(blocks_ahead=-1),
-    ):
-        with pytest.raises(ValueError, match="expected"):
-            arrange_blocks(wrong)
 
 
 def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):

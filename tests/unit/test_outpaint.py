@@ -8,6 +8,8 @@ import pytest
 import torch
 from helpers import QUICK, random_scene, scenes_equal, small_spec
 
+from jobs.implementation.outpaint_scenes import arrange_blocks
+from jobs.outpaint_scenes import Config
 from models.composition.infinite import InfiniteScene
 from models.composition.outpaint import (
     BlockComposer,
@@ -349,3 +351,23 @@ def test_infinite_scene_is_independent_of_request_order(pipeline):
         one.get_scene(10.0, -10.0, 5.0, 5.0)
     with pytest.raises(ValueError, match="label 'dense' is unknown"):
         InfiniteScene(pipeline, "dense")
+
+
+def test_extent_is_rounded_up_to_whole_blocks():
+    for extent_m, counts, arrangement in (
+        ((128.0, 65.0), (1, 1, 1, 1), ("outward", 0.5, "none", 0.0)),
+        ((160.0, 160.0), (1, 1, 1, 1), ("colours", 0.25, "all", 0.0)),
+        ((512.0, 128.0), (5, 5, 1, 1), ("colours", 0.25, "all", 0.0)),
+    ):
+        assert arrange_blocks(Config(extent_m=extent_m)) == (counts, arrangement)
+        step_m = 64 * (1 - arrangement[1])
+        assert all(64 + 2 * count * step_m >= side for count, side in zip(counts[1:3], extent_m, strict=True))
+    far = arrange_blocks(Config(extent_m=(512.0, 128.0), order="outward", free_blocks="off-street", margin=0.0625))
+    assert far == ((7, 7, 1, 1), ("outward", 0.5, "off-street", 0.0625))
+    for wrong in (
+        Config(extent_m=(32.0, 64.0)),
+        Config(blocks_ahead=0, blocks_behind=0, blocks_left=0, blocks_right=0),
+        Config(blocks_ahead=-1),
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            arrange_blocks(wrong)
