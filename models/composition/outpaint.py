@@ -607,8 +607,8 @@ class BlockComposer:
         Returns:
             The block, which contains only the cells that it owns.
         """
-        own = extract_new_part(generated, condition.known, condition.new_pixels, blend)
-        own = merge_scenes([own], [own.grid.upsample_cells(condition.owned)], own)
+        owned = generated.grid.upsample_cells(condition.owned)
+        own = extract_new_part(generated, condition.known, condition.new_pixels, blend, owned)
         return SceneBlock(own, latent, condition.datum_m, condition.known_ground)
 
     def stitch(self, blocks: Mapping[BlockIndex, SceneBlock], like: Scene, grid: Grid | None = None) -> Scene:

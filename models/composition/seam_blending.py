@@ -83,7 +83,9 @@ def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
     return replace(blended, center_m=center_m)
 
 
-def extract_new_part(generated: Scene, known: Scene, new: np.ndarray, blend: bool = True) -> Scene:
+def extract_new_part(
+    generated: Scene, known: Scene, new: np.ndarray, blend: bool = True, kept: np.ndarray | None = None
+) -> Scene:
     """Return the generated part of a scene.
 
     Args:
@@ -92,14 +94,16 @@ def extract_new_part(generated: Scene, known: Scene, new: np.ndarray, blend: boo
         new: (rows, cols) bool mask of the generated pixels.
         blend: If True, blend the ground into the known ground, and remove copies of known objects. If False, leave the
             decoded content as it is, as in the paper.
+        kept: (rows, cols) bool mask of those pixels of `new` that the result contains; None: all.
 
     Returns:
-        The scene, which contains only the content of `new`.
+        The scene, which contains only the content of `kept`.
     """
+    kept = new if kept is None else kept
     if not blend:
-        return merge_scenes([generated], [new], generated)
+        return merge_scenes([generated], [kept], generated)
     fresh = generated.select(~find_regenerated_objects(generated, known))
-    return merge_scenes([blend_ground(fresh, known, new)], [new], generated)
+    return merge_scenes([blend_ground(fresh, known, new)], [kept], generated)
 
 
 def extrapolate_ground(known: Scene, unknown: np.ndarray) -> Scene:
