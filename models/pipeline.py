@@ -28,6 +28,7 @@ from models.composition.generator import StepCallback
 from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
 from models.composition.outpaint import BlockIndex, choose_arrangement, label_blocks, outpaint_scene
 from models.composition.road_sketch import RoadMap, SketchedRoad
+from models.composition.street_plan import require_planner
 from models.dit import DiT
 from models.execution import SamplingExecution
 from models.labels import FREE, find_label_index, split_label
@@ -67,12 +68,13 @@ from models.scene import Scene
 from models.tensors import EXISTENCE_THRESHOLD, make_empty_scene, make_layout_batch
 
 COMPONENTS = {"lvae": LayoutVAE, "dit": DiT}
+STREET_PLANNER = "street_planner"  # Name of an optional component, a DiT for street plans.
 NEIGHBOUR_LATENTS = ("reencode", "copy", "paper")
 SCHEDULER_CONFIG = "scheduler/scheduler_config.json"
 MAX_PAG_SCALE = 20.0
 PAG_START = 0.2  # Lowest timestep with perturbed-attention guidance, as a share of the number of timesteps.
 INDEX_RULES: dict[str, Rule] = {
-    **dict.fromkeys((*COMPONENTS, "scheduler"), Sequential(Text(), 2, 2)),
+    **dict.fromkeys((*COMPONENTS, STREET_PLANNER, "scheduler"), Sequential(Text(), 2, 2)),
     "num_inference_steps": Integer(1, 2**31),
     "noise_scaling": Number(0.9, 1.1),
     "existence_threshold": Number(0, 1),
@@ -152,10 +154,12 @@ class PrITTIPipeline:
             not do this.
         pag_scale: Default scale of perturbed-attention guidance (`DiT.apply_modulations`) at noisy timesteps; 0
             switches it off, as in the paper.
+        street_planner: Network that plans the streets of large scenes (models/composition/street_plan.py); None: blocks
+            do not follow a plan, as in the paper.
 
     Raises:
-        ValueError: The LayoutSpec or the shape of the latents of the DiT differs from that of `lvae`, or the noise
-            schedule of the scheduler from that of the DiT.
+        ValueError: The LayoutSpec or the shape of the latents of the DiT differs from that of `lvae`, the noise
+            schedule of the scheduler from that of the DiT, or `street_planner` plans no streets.
     """
 
     def __init__(
@@ -170,8 +174,13 @@ class PrITTIPipeline:
         attach: bool = True,
         pag_scale: float = 0.0,
         num_inference_steps: int = NUM_INFERENCE_STEPS,
+        street_planner: DiT | None = None,
     ) -> None:
         self.lvae, self.dit = lvae.eval().requires_grad_(False), dit.eval().requires_grad_(False)
+        self.street_planner: DiT | None = None
+        if street_planner is not None:
+            require_planner(street_planner)
+            self.street_planner = street_planner.eval().requires_grad_(False)
         self.scheduler = SchedulerConfig.ddpm(dit.diffusion)
         if scheduler is not None:
             self.scheduler = scheduler
@@ -214,7 +223,8 @@ class PrITTIPipeline:
         """
         path = Path(find_pipeline_path(directory))
         index = read_config(path / INDEX_NAME, cls.__name__)
-        for name, kind in COMPONENTS.items():
+        kinds = COMPONENTS | ({STREET_PLANNER: DiT} if STREET_PLANNER in index else {})
+        for name, kind in kinds.items():
             if index.get(name) != (expected := [kind.__module__, kind.__name__]):
                 raise ValueError(f"{path / INDEX_NAME}: {name} is {show_value(index.get(name))}, expected {expected}")
         try:
@@ -229,8 +239,8 @@ class PrITTIPipeline:
             scheduler = SchedulerConfig.parse(class_name, options)
         except ValueError as error:
             raise ValueError(f"{path / SCHEDULER_CONFIG}: {error}") from error
-        components = {name: kind.from_pretrained(path / name, torch_dtype) for name, kind in COMPONENTS.items()}
-        names = INDEX_RULES.keys() - COMPONENTS.keys() - {"scheduler"}
+        components = {name: kind.from_pretrained(path / name, torch_dtype) for name, kind in kinds.items()}
+        names = INDEX_RULES.keys() - COMPONENTS.keys() - {"scheduler", STREET_PLANNER}
         defaults = {name: index[name] for name in names if name in index}
         try:
             return cls(**components, scheduler=scheduler, **defaults)
@@ -246,10 +256,13 @@ class PrITTIPipeline:
         path = Path(directory)
         self.lvae.save_pretrained(path / "lvae")
         self.dit.save_pretrained(path / "dit")
+        if self.street_planner is not None:
+            self.street_planner.save_pretrained(path / STREET_PLANNER)
         scheduler = path / SCHEDULER_CONFIG
         scheduler.parent.mkdir(exist_ok=True)
         write_config(self.scheduler_config.class_name, self.scheduler_config.config, scheduler)
-        index = {name: [kind.__module__, kind.__name__] for name, kind in COMPONENTS.items()}
+        kinds = COMPONENTS | ({} if self.street_planner is None else {STREET_PLANNER: DiT})
+        index = {name: [kind.__module__, kind.__name__] for name, kind in kinds.items()}
         index["scheduler"] = ["diffusers", self.scheduler_config.class_name]
         write_config(type(self).__name__, index | self.config, path / INDEX_NAME)
 
@@ -299,7 +312,7 @@ class PrITTIPipeline:
         return self.scheduler_config.class_name == "DDPMScheduler"
 
     def register_modules(self, **components: Any) -> None:
-        """Replace `lvae`, `dit` or `scheduler`.
+        """Replace `lvae`, `dit`, `scheduler` or `street_planner`.
 
         Args:
             **components: New components by name.
@@ -323,8 +336,9 @@ class PrITTIPipeline:
 
     @property
     def components(self) -> dict[str, Any]:
-        """Layout VAE, DiT and scheduler by name."""
-        return {"lvae": self.lvae, "dit": self.dit, "scheduler": self.scheduler}
+        """Layout VAE, DiT, scheduler, and street planner if there is one, by name."""
+        planner = {} if self.street_planner is None else {STREET_PLANNER: self.street_planner}
+        return {"lvae": self.lvae, "dit": self.dit, "scheduler": self.scheduler} | planner
 
     def to(self, *args: Any, **kwargs: Any) -> PrITTIPipeline:
         """Move the networks to a device or data type.
@@ -338,6 +352,8 @@ class PrITTIPipeline:
         """
         self.lvae.to(*args, **kwargs)
         self.dit.to(*args, **kwargs)
+        if self.street_planner is not None:
+            self.street_planner.to(*args, **kwargs)
         return self
 
     def set_execution(self, execution: SamplingExecution) -> None:

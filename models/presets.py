@@ -167,6 +167,39 @@ class DiTPreset:
         return {field.name: getattr(self.model, field.name) for field in fields(self.model)}
 
 
+@dataclass(frozen=True)
+class StreetPlannerPreset:
+    """Architecture and training options of a street planner (models/composition/street_plan.py).
+
+    Attributes:
+        model: Architecture.
+        batch_size: Samples per step.
+        steps: Number of training steps.
+        num_maps: Number of street maps for training.
+        num_test_maps: Number of held-out street maps.
+        learning_rate: Learning rate at the start of the decay.
+        warmup_steps: Number of initial steps during which the learning rate rises linearly.
+        weight_decay: Weight decay of AdamW.
+        ema_decay: Decay of the exponential moving average of the weights.
+        label_dropout: Probability that a training sample gets the null label.
+    """
+
+    model: DiTConfig
+    batch_size: int
+    steps: int
+    num_maps: int
+    num_test_maps: int
+    learning_rate: float = 1e-3
+    warmup_steps: int = 50
+    weight_decay: float = 1e-6
+    ema_decay: float = 0.999
+    label_dropout: float = 0.1
+
+    def architecture(self) -> dict:
+        """Return all keyword arguments of `DiT` except those that depend on the street maps."""
+        return {field.name: getattr(self.model, field.name) for field in fields(self.model)}
+
+
 SMALL_DIT = DiTConfig(2, 6, 256, 4, prediction="v_prediction")
 TOWN_DIT = DiTConfig(2, 8, 288, 6, prediction="v_prediction", inpainting=True)
 PAPER_DECODING: dict[str, Any] = {"neighbour_latents": "paper", "attach": False}
@@ -188,6 +221,12 @@ DIT_PRESETS: dict[str, DiTPreset] = {
     "av2":         DiTPreset("av2",      DiTConfig(2, 12, 768, 12),  256, 400_000, **PAPER_DECODING),
 }
 # fmt: on
+
+
+STREET_PLANNER_PRESETS: dict[str, StreetPlannerPreset] = {
+    "smoke": StreetPlannerPreset(DiTConfig(8, 1, 32, 2, "v_prediction", True), 4, 8, 4, 4, warmup_steps=0),
+    "town": StreetPlannerPreset(DiTConfig(4, 6, 192, 6, "v_prediction", True), 32, 10_000, 8_000, 400),
+}
 
 
 def find_preset(table: dict[str, Preset], name: str) -> Preset:

@@ -26,6 +26,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from models.base import ConfiguredModel
 from models.batch import LayoutBatch
+from models.composition.street_distances import measure_border_distances
 from models.dit import DiT
 from models.execution import require_bf16
 from models.labels import PART_DROPOUT, list_dropped_labels
@@ -39,7 +40,12 @@ from models.sampling.diffusion import (
     make_keyed_generator,
     start_drawing,
 )
-from models.sampling.known_regions import NUM_UNIFORM, make_training_masks
+from models.sampling.known_regions import (
+    NUM_STREET_UNIFORM,
+    NUM_UNIFORM,
+    make_street_masks,
+    make_training_masks,
+)
 from models.vae.losses import compute_lvae_loss
 from models.vae.matching import NonFiniteCostError
 
@@ -359,11 +365,14 @@ class DiffusionLossConfig:
         loss_weighting: Weighting of the timesteps (`compute_loss_weight`).
         sample_posterior: Whether each step draws latents from the posteriors of the layout VAE. If False, the latents
             are the means of the posteriors.
+        scene_px: Side of a scene in pixels of a street plan, if the network is a street planner
+            (`models.composition.street_plan`). None: the network is that of stage 2.
     """
 
     timestep_sampling: TimestepSampling = "uniform"
     loss_weighting: LossWeighting = "uniform"
     sample_posterior: bool = True
+    scene_px: int | None = None
 
 
 def make_diffusion_loss(dit: DiT, label_dropout: float, config: DiffusionLossConfig | None = None) -> LossFunction:
@@ -379,7 +388,7 @@ def make_diffusion_loss(dit: DiT, label_dropout: float, config: DiffusionLossCon
 
     Returns:
         A function that computes the losses from a batch of posteriors (`mean`, `logvar`) and labels (`label`). An
-        inpainting model receives random known parts (`make_training_masks`), which have no error.
+        inpainting model receives random known parts (`make_training_masks`, `make_street_masks`), which have no error.
     """
     config = config or DiffusionLossConfig()
     diffusion = dit.diffusion
@@ -389,17 +398,22 @@ def make_diffusion_loss(dit: DiT, label_dropout: float, config: DiffusionLossCon
     parts = list_dropped_labels(dit.config.label)
     remaining = None if parts is None else torch.tensor(parts, device=dit.device)
     inpainting = dit.config.inpainting
+    border_m = torch.zeros(shape[1:], device=dit.device)
+    if config.scene_px is not None:
+        inside = slice((shape[1] - config.scene_px) // 2, (shape[1] + config.scene_px) // 2)
+        border_m[inside, inside] = torch.from_numpy(measure_border_distances(config.scene_px, config.scene_px)).float()
+    num_mask = 0 if not inpainting else NUM_UNIFORM if config.scene_px is None else NUM_STREET_UNIFORM
 
     def loss(
         model: Callable[..., Any], arrays: dict[str, Tensor], generators: list[torch.Generator]
     ) -> dict[str, Tensor]:
-        mean, logvar, label = arrays["mean"].float(), arrays["logvar"].float(), arrays["label"]
+        mean, label = arrays["mean"].float(), arrays["label"]
         device = mean.device
         # No line below waits for a GPU. Random numbers are thus drawn during the backward pass of the previous step.
         *posterior_noise, noise = sample_noise(generators, shape, device, count=1 + config.sample_posterior)
         count = 2 if remaining is None else 4
-        uniform = sample_uniform(generators, count + NUM_UNIFORM * inpainting, device)
-        drawn = mean + (0.5 * logvar).exp() * posterior_noise[0] if posterior_noise else mean
+        uniform = sample_uniform(generators, count + num_mask, device)
+        drawn = mean + (0.5 * arrays["logvar"].float()).exp() * posterior_noise[0] if posterior_noise else mean
         latent = (drawn - shift) / scale
         timestep = sample_timesteps(uniform[:, 0], config.timestep_sampling, diffusion.num_timesteps)
         if remaining is not None:
@@ -408,7 +422,11 @@ def make_diffusion_loss(dit: DiT, label_dropout: float, config: DiffusionLossCon
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
         noisy = diffusion.add_noise(latent, noise, timestep)
         if inpainting:
-            mask = make_training_masks(uniform[:, count:], shape[0], shape[1])
+            mask = (
+                make_training_masks(uniform[:, count:], shape[0], shape[1])
+                if config.scene_px is None
+                else make_street_masks(uniform[:, count:], mean, border_m)
+            )
             noisy = join_known(noisy, InpaintCondition(latent, mask))
         error = F.mse_loss(model(noisy, timestep, label).float(), noise, reduction="none")
         error = (error * mask if inpainting else error).flatten(1).mean(1)

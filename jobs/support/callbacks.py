@@ -9,11 +9,13 @@ from typing import cast
 
 import numpy as np
 import torch
+from scipy.ndimage import label
 
+from models.composition.street_plan import StreetPlan
 from models.dit import DiT
 from models.lvae import LayoutVAE
 from models.sampling.diffusion import Diffusion, SamplingSchedule, SceneNoise, make_keyed_generator, sample
-from models.scene import Scene
+from models.scene import Grid, Scene
 from models.tensors import decode_layout, make_layout_batch
 from models.training import Trainer, sample_noise
 from models.vae.accuracy import compute_accuracy, join_pairs, pair_primitives
@@ -26,11 +28,13 @@ from pipelines.metrics.reconstruction import (
     sum_ground,
 )
 from pipelines.rendering.render import arrange_contact_sheet, render_bev
-from pipelines.schema.tables import find_shards, read_scenes
+from pipelines.schema.tables import Shard, find_shards, read_scenes
 from pipelines.training.data_loader import LatentReader
 from pipelines.training.latents import load_lvae
+from pipelines.training.street_map_reader import StreetMapReader
 
 SHOWN = 4
+PLAN_M = 512.0
 
 
 @lru_cache(maxsize=2)
@@ -137,6 +141,32 @@ class SamplingCheck:
         return {"validation_loss": loss}, {
             "samples": arrange_contact_sheet([render_bev(s) for s in scenes], columns=SHOWN)
         }
+
+
+@dataclass(frozen=True)
+class StreetPlanCheck:
+    """Validation of a street planner: the loss on held-out street maps, and a plan of PLAN_M x PLAN_M."""
+
+    shards: list[Shard]
+    reader: StreetMapReader
+    count: int = 64
+
+    @torch.no_grad()
+    def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+        """Return the validation loss, the share of road in the largest connected part of a plan, and its picture."""
+        planner = cast(DiT, trainer.ema_model().eval())
+        rows = np.arange(min(self.count, self.shards[0].read("street_maps", ["map_id"]).num_rows))
+        arrays = {name: torch.from_numpy(v).to(trainer.device) for name, v in self.reader(self.shards[0], rows).items()}
+        loss = float(trainer.loss(planner, arrays, [make_keyed_generator(1, k) for k in rows.tolist()])["loss"])
+        side = round(PLAN_M)
+        road, paved = StreetPlan(planner).draw(Grid(PLAN_M / 2, PLAN_M / 2, 1.0, side, side))
+        planner.train()
+        parts, _ = cast(tuple[np.ndarray, int], label(road))
+        sizes = np.bincount(parts.ravel())[1:]
+        scores = {"validation_loss": loss, "validation_road": float(road.mean())}
+        scores["validation_connectivity"] = float(sizes.max() / sizes.sum()) if len(sizes) else 0.0
+        picture = np.where(road, 255, np.where(paved, 128, 0)).astype(np.uint8)
+        return scores, {"plan": picture[:, :, None].repeat(3, axis=2)}
 
 
 @lru_cache(maxsize=1)

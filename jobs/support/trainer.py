@@ -52,8 +52,8 @@ class TrainingRun:
 
     The function `build(device, wrap)` returns the Trainer. The function `validate(trainer)` returns metrics and
     pictures (arrays by name); it runs on rank 0 at every checkpoint. The field `identity` holds the options that must
-    not change when a run is resumed. With `round_weights`, weights of results are rounded to float16; training itself
-    does not change.
+    not change when a run is resumed. Error messages name samples by `id_column`, a table and a column. With
+    `round_weights`, weights of results are rounded to float16; training itself does not change.
     """
 
     name: str
@@ -68,6 +68,7 @@ class TrainingRun:
     log_every: int
     validate: Callable[[Trainer], tuple[dict[str, float], dict[str, np.ndarray]]] | None = None
     round_weights: bool = False
+    id_column: tuple[str, str] = ("scenes", "scene_id")
 
 
 def convert_to_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
@@ -113,7 +114,7 @@ def train_worker(run: TrainingRun) -> None:
         try:
             losses = trainer.step(convert_to_tensors(batch), positions, weight)
         except NonFiniteLossError as error:
-            raise ValueError(with_scene_ids(error, run.stream)) from error
+            raise ValueError(with_sample_ids(error, run.stream, run.id_column)) from error
         except torch.OutOfMemoryError:
             is_memory_full = True
         if is_memory_full:  # Here, the error no longer keeps the tensors of the failed step in memory.
@@ -183,23 +184,26 @@ def read_step(run: TrainingRun) -> int:
     return int(_internal_kv_get(f"pritti-step-{run.tracker.run_id}") or 0)
 
 
-def with_scene_ids(error: NonFiniteLossError, stream: Stream) -> str:
-    """Return the error message for a non-finite loss, with the ids of the scenes that caused this loss.
+def with_sample_ids(
+    error: NonFiniteLossError, stream: Stream, id_column: tuple[str, str] = ("scenes", "scene_id")
+) -> str:
+    """Return the error message for a non-finite loss, with the ids of the samples that caused this loss.
 
     Args:
         error: Error with the positions of the samples.
-        stream: Order of the training scenes.
+        stream: Order of the training samples.
+        id_column: Table and column of the ids.
 
     Returns:
         The message.
     """
+    table, column = id_column
     shards, rows = stream.positions(error.step * stream.batch_size, stream.batch_size)
-    ids = [
-        stream.shards[shards[k]].read("scenes", ["scene_id"])["scene_id"][int(rows[k])].as_py() for k in error.positions
-    ]
-    return (
-        f"{error}. Scenes: {', '.join(ids)}; inspect them with jobs/inspect_scenes.py scene ID" if ids else str(error)
-    )
+    ids = [stream.shards[shards[k]].read(table, [column])[column][int(rows[k])].as_py() for k in error.positions]
+    if not ids:
+        return str(error)
+    hint = "; inspect them with jobs/inspect_scenes.py scene ID" if table == "scenes" else ""
+    return f"{error}. Samples: {', '.join(ids)}{hint}"
 
 
 def measure_waiting(iterator: Iterator) -> Iterator[tuple[Any, float]]:

@@ -181,11 +181,24 @@ class RoadMap:
             x and y of such a point (m), and the class of the ground; None if at most MAX_CONTRADICTION of the pixels
             deep inside of the roads lie on other ground.
         """
-        road, _ = self.draw(scene.grid)
-        depth_m = np.asarray(distance_transform_edt(road)) * scene.grid.resolution_m
-        row, col = np.nonzero(depth_m > CORE_M)
-        found = _find_other_ground(scene, scene.grid.x_m()[row], scene.grid.y_m()[col])
-        return found[len(found) // 2] if len(found) > MAX_CONTRADICTION * len(row) else None
+        return find_deep_contradiction(self.draw(scene.grid)[0], scene)
+
+
+def find_deep_contradiction(road: np.ndarray, scene: Scene) -> tuple[float, float, str] | None:
+    """Find ground of another class deep inside of roads.
+
+    Args:
+        road: (rows, cols) bool mask of the roads on the grid of the scene.
+        scene: Scene.
+
+    Returns:
+        x and y of such a point (m), and the class of the ground; None if at most MAX_CONTRADICTION of the pixels deep
+        inside of the roads lie on other ground.
+    """
+    depth_m = np.asarray(distance_transform_edt(road)) * scene.grid.resolution_m
+    row, col = np.nonzero(depth_m > CORE_M)
+    found = _find_other_ground(scene, scene.grid.x_m()[row], scene.grid.y_m()[col])
+    return found[len(found) // 2] if len(found) > MAX_CONTRADICTION * len(row) else None
 
 
 def _find_other_ground(scene: Scene, x_m: np.ndarray, y_m: np.ndarray) -> list[tuple[float, float, str]]:

@@ -175,7 +175,7 @@ class SamplingSchedule:
 
 
 # Purposes of noise. Generation and outpainting of the same scene index must start from different noise.
-GENERATE, OUTPAINT, INPAINT = 1, 2, 3
+GENERATE, OUTPAINT, INPAINT, PLAN = 1, 2, 3, 4
 
 
 @cache
@@ -237,7 +237,7 @@ class SceneNoise:
         indices: Key of each scene.
         shape: Shape of the noise of one scene.
         device: Device of the noise.
-        purpose: GENERATE, OUTPAINT or INPAINT.
+        purpose: GENERATE, OUTPAINT, INPAINT or PLAN.
         ahead: Whether threads draw the next noise. None: if the device is a GPU.
     """
 

@@ -58,3 +58,47 @@ def make_training_masks(
     half = channels // 2
     parts = [ground[:, None].expand(-1, half, -1, -1), objects[:, None].expand(-1, channels - half, -1, -1)]
     return 1 - torch.cat(parts, dim=1).float()
+
+
+NUM_STREET_UNIFORM = 8  # Random numbers per sample that `make_street_masks` needs.
+# Shares of street plans without a known part, with a known scene in the middle, with a known half, with all but a
+# corner known, and with known roads of a rectangle, such as sketched roads. They add up to 1.
+STREET_SHARES = (0.1, 0.15, 0.2, 0.45, 0.1)
+SHARE_HALF = 0.5  # Share of known halves and corners whose border is the middle, as on a grid of windows.
+
+
+def make_street_masks(
+    uniform: Float[Tensor, "b 8"], distance_m: Float[Tensor, "b 2 size size"], border_m: Float[Tensor, "size size"]
+) -> Float[Tensor, "b 2 size size"]:
+    """Make masks of street plans from random numbers.
+
+    Either nothing is known; or a scene in the middle, with those distances that do not depend on its surroundings; or
+    the plan up to a row or a column; or all of the plan but a corner; or the roads of a rectangle.
+
+    Args:
+        uniform: Random numbers between 0 and 1, NUM_STREET_UNIFORM per sample.
+        distance_m: Signed distances of the street plans (m).
+        border_m: Distances of the pixels inside of a scene in the middle to its border; 0 outside (m).
+
+    Returns:
+        Masks; 1 marks values to generate, 0 marks known values.
+    """
+    size = distance_m.shape[-1]
+    kind, ends, corners, turns = uniform.split([1, 2, 4, 1], dim=1)
+    shares = torch.tensor(STREET_SHARES, device=uniform.device).cumsum(0)
+    kind = (kind > shares[:-1]).sum(1)[:, None, None]
+    cell, turn = torch.arange(size, device=uniform.device), (turns[:, 0] * 8).long()
+    # A number below SHARE_HALF gives the middle, others any row or column.
+    end = torch.where(ends < SHARE_HALF, size // 2, 1 + ((ends - SHARE_HALF) / (1 - SHARE_HALF) * (size - 1)).long())
+    place = torch.stack([torch.where((turn & bit > 0)[:, None], size - 1 - cell, cell) for bit in (1, 2)], dim=1)
+    rows, cols = (place < end[:, :, None]).unbind(1)
+    half = torch.where((turn & 4 > 0)[:, None, None], rows[:, :, None], cols[:, None, :])
+    corner = rows[:, :, None] | cols[:, None, :]
+    scene = ((border_m > 0) & (distance_m.abs() <= border_m)).all(1)
+    low, high = (corners * (size + 1)).long().view(-1, 2, 2).sort(dim=2).values.unbind(2)
+    in_rows, in_cols = ((cell >= low[:, :, None]) & (cell < high[:, :, None])).unbind(1)
+    roads = in_rows[:, :, None] & in_cols[:, None, :] & (distance_m[:, 0] >= 0)
+    known = torch.zeros_like(scene)
+    for number, region in enumerate((scene, half, corner, roads), start=1):
+        known = torch.where(kind == number, region, known)
+    return (~known).to(distance_m)[:, None].expand_as(distance_m)

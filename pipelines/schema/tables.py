@@ -222,6 +222,30 @@ def make_latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
         ("mean",   tensor, "1", "Mean of the latent's normal distribution: float16 (channel, row, col), C order."),
         ("logvar", tensor, "1", "Natural logarithm of the latent's variance: float16 (channel, row, col), C order."),
     )
+
+
+def make_street_maps_schema(shape: tuple[int, int, int]) -> pa.Schema:
+    """Return the schema of the table street_maps.
+
+    Args:
+        shape: (C, h, w) shape of the distances of one map.
+
+    Returns:
+        Schema.
+    """
+    return _make_schema(
+        "One row per crop of a town at any place and heading, as signed distances to the borders of its streets. "
+        "Rows and columns have the order of the rasters; a pixel has a side of 4 m.",
+        ("map_id",   pa.string(), "", "Name of the map."),
+        _SEQUENCE,
+        ("num_vegetation",       pa.int32(),   "1",  "Number of vegetation primitives in the crop."),
+        ("vegetation_volume_m3", pa.float64(), "m3", "Sum of the volumes of these primitives."),
+        ("num_vehicle",          pa.int32(),   "1",  "Number of big and small vehicles in the crop."),
+        ("vehicle_volume_m3",    pa.float64(), "m3", "Sum of the volumes of these vehicles."),
+        ("distance_m", pa.fixed_shape_tensor(pa.float16(), shape), "m",
+         "Signed distances (channel, row, col) to the border of the roads, and to the border of roads and sidewalks "
+         "taken together; positive inside, clipped to 8 m."),
+    )
 # fmt: on
 
 

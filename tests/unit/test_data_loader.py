@@ -6,7 +6,7 @@ import pytest
 from helpers import SHARD_SIZES, small_spec
 
 from jobs.implementation.train_dit import make_stream
-from jobs.support.trainer import with_scene_ids
+from jobs.support.trainer import with_sample_ids
 from jobs.train_dit import Config
 from models.augment import Augmentation
 from models.tensors import encode_layout
@@ -68,7 +68,7 @@ def test_nonfinite_loss_names_its_scenes(layout_shards):
     stream = Stream(layout_shards, SHARD_SIZES, 4, seed=0)
     shard, row = stream.positions(8, 4)
     ids = [layout_shards[shard[k]].scenes([int(row[k])])[0].scene_id for k in (1, 3)]
-    message = with_scene_ids(NonFiniteLossError(2, [1, 3]), stream)
+    message = with_sample_ids(NonFiniteLossError(2, [1, 3]), stream)
     assert "step 2: the loss is not finite for samples [1, 3]" in message
-    assert f"Scenes: {ids[0]}, {ids[1]}; inspect them" in message
-    assert "not finite for all samples" in with_scene_ids(NonFiniteLossError(2, []), stream)
+    assert f"Samples: {ids[0]}, {ids[1]}; inspect them" in message
+    assert "not finite for all samples" in with_sample_ids(NonFiniteLossError(2, []), stream)

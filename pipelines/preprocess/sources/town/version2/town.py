@@ -6,6 +6,7 @@ the annotated ground ends behind the houses. Buildings overlap neither streets n
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -117,10 +118,7 @@ def make_large_scene(seed: int, extent_m: float, resolution_m: float = 0.25) -> 
             f"extent_m is {extent_m:g}, expected at least {FREE_CROP_M:g} m and a multiple of {resolution_m:g} m"
         )
     grid = Grid(FREE_CROP_M + margin_m, extent_m / 2, resolution_m, pixels, pixels)
-    main, _ = TOWN_KINDS[seed % len(TOWN_KINDS)]
-    # The diagonal, because a street may have any direction.
-    count = 2 + int(np.ceil((np.sqrt(2) * extent_m + FREE_CROP_M) / SPACING_M[main][0]))
-    drive, streets, land = _make_drive(seed, (count, count))
+    drive, streets, land = _make_drive(seed, _count_blocks(seed, np.sqrt(2) * extent_m + FREE_CROP_M))
     low, high = _find_built_area(streets)
     middle = (low + high) / 2
     side = np.linspace(-1, 1, 9)
@@ -138,6 +136,36 @@ def make_large_scene(seed: int, extent_m: float, resolution_m: float = 0.25) -> 
             still = replace(drive, frame=np.full(len(drive), FREE_FRAMES_START))  # No moving box belongs to this frame.
             return still.scene(int(index), "test", grid)
     raise RuntimeError(f"no crop of {extent_m:g} m fits into town {seed}")
+
+
+def make_large_crops(seed: int, count: int, grid: Grid) -> Iterator[Scene]:
+    """Make crops of any size at any place and heading of one town, without moving objects.
+
+    Args:
+        seed: Seed of the town.
+        count: Number of crops.
+        grid: Grid of the crops.
+
+    Yields:
+        Crops, in the frames of their poses.
+    """
+    length_m, width_m = grid.front_m - grid.back_m, grid.left_m - grid.right_m
+    extent_m = float(np.hypot(length_m, width_m)) + max(length_m, width_m)
+    drive, streets, land = _make_drive(seed, _count_blocks(seed, extent_m))
+    poses = _draw_free_poses(np.random.default_rng([7305, seed]), streets, land, count, grid)
+    frame = FREE_FRAMES_START + np.arange(count)
+    drive = replace(drive, frame=frame, world_from_imu=poses, free_pose=np.ones(count, bool))
+    for index in range(count):
+        yield drive.at(np.array([index]), grid).scene(0, "unused", grid)
+
+
+def _count_blocks(seed: int, extent_m: float) -> tuple[int, int]:
+    """Return the number of blocks along u and v of a town that is wider than extent_m. Streets may have any direction,
+    so this should be the diagonal of a scene.
+    """
+    main, _ = TOWN_KINDS[seed % len(TOWN_KINDS)]
+    count = 2 + int(np.ceil(extent_m / SPACING_M[main][0]))
+    return count, count
 
 
 def _find_built_area(streets: Streets) -> tuple[np.ndarray, np.ndarray]:
@@ -279,21 +307,25 @@ def _sink_boxes(boxes: dict[str, np.ndarray], rng: np.random.Generator) -> dict[
 # ---------------------------------------------------------------- free poses
 
 
-def _draw_free_poses(rng: np.random.Generator, streets: Streets, land: Land, count: int) -> np.ndarray:
+def _draw_free_poses(
+    rng: np.random.Generator, streets: Streets, land: Land, count: int, grid: Grid | None = None
+) -> np.ndarray:
     """Return poses (count, 3, 4) whose crops lie in the built area at any place and heading.
 
-    The first poses do not depend on `count`.
+    The first poses do not depend on `count`. The crops have the size of scenes, or that of a grid.
     """
+    grid = grid or Grid()
     low, high = _find_built_area(streets)
     poses = np.empty((count, 3, 4))
-    square = np.array([[0, 1], [1, 1], [1, -1], [0, -1]]) * [FREE_CROP_M, FREE_CROP_M / 2]
+    ends = (grid.back_m, grid.left_m), (grid.front_m, grid.left_m), (grid.front_m, grid.right_m)
+    square = np.array([*ends, (grid.back_m, grid.right_m)])
     found = 0
     for _ in range(MAX_TRIES):
         if found == count:
             return poses
         middle, yaw = land.xy(rng.uniform(low, high)), rng.uniform(-np.pi, np.pi)
         forward, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
-        origin = middle - forward * FREE_CROP_M / 2
+        origin = middle - forward * (grid.back_m + grid.front_m) / 2
         corners = land.uv(origin + square @ np.stack([forward, left]))
         if (corners < low).any() or (corners > high).any():
             continue

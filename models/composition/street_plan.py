@@ -1,0 +1,268 @@
+"""Plan the streets of a city with a diffusion model, before its blocks are generated.
+
+Blocks that do not know each other cannot agree on streets. A street planner is a small `models.dit.DiT` for signed
+distances (street_distances.py) over windows of 256 m. It continues known parts. The first window knows the streets of
+the given scene. Each further window knows those of its predecessors, which cover half of a window on the axes through
+the first window, and three quarters elsewhere. Blocks then take the plan as known ground, like a map of all roads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from models.composition.outpaint import BlockGrid, BlockIndex, rank_outward
+from models.composition.road_sketch import SketchedRoad, draw_roads
+from models.composition.street_distances import (
+    CHANNELS,
+    PIXEL_M,
+    REACH_M,
+    StreetDistances,
+    measure_border_distances,
+    measure_street_distances,
+    read_street_masks,
+)
+from models.dit import DiT
+from models.labels import ANY, compose_label, find_label_index, split_label
+from models.sampling.diffusion import PLAN, InpaintCondition, SceneNoise, sample_with_scheduler, with_known
+from models.sampling.schedulers import SAMPLERS, SchedulerConfig
+from models.scene import Grid, Scene
+
+SAMPLER = "dpm++"
+LABEL_KIND = "partial"  # Kind of label of a street planner: densities of vegetation and vehicles, or any.
+SKETCH_RESOLUTION_M = 0.5  # Side of the pixels from which the distances of sketched roads are computed.
+LabelAt = Callable[[float, float], str]  # Maps x and y (m, frame of block (0, 0)) to the label of the block there.
+
+
+def require_planner(planner: DiT) -> None:
+    """Check that a network is a street planner.
+
+    Args:
+        planner: Network.
+
+    Raises:
+        ValueError: The network generates no street plans, or cannot continue them.
+    """
+    config = planner.config
+    if config.channels != CHANNELS or not config.inpainting or config.label != LABEL_KIND or config.size % 2:
+        raise ValueError(
+            f"a street planner has {CHANNELS} channels, an even size, inpainting and {LABEL_KIND} labels; this network"
+            f" has {config.channels} channels, size {config.size}, inpainting {config.inpainting} and {config.label}"
+            " labels"
+        )
+
+
+def convert_label(kind: str, label: str) -> str:
+    """Return the label of a street plan that fits the label of a block.
+
+    Args:
+        kind: Kind of label of the blocks, a key of `models.labels.LABELS`.
+        label: Label of a block.
+
+    Returns:
+        Label of the street planner.
+    """
+    return str(compose_label(LABEL_KIND, *split_label(kind, label), True))
+
+
+class StreetPlan:
+    """An unbounded street plan that generates windows on demand. It does not depend on the order of requests.
+
+    Args:
+        planner: Street planner.
+        given: Scene that the plan continues. Its grid must consist of whole pixels of the plan. None: nothing is given,
+            and the first window has its centre at the origin.
+        label_at: Label of the streets at a place (`convert_label`); None: any.
+        seed: Seed of the noise.
+        scene_index: Index of the scene. The noise depends on the seed, this index and the window.
+        num_inference_steps: Number of denoising steps; None: the default of the sampler.
+        sketches: Sketched roads that the plan contains, in the frame of the given scene.
+
+    Raises:
+        ValueError: The network is no street planner, or the scene has no roads and sidewalks or another grid.
+    """
+
+    def __init__(
+        self,
+        planner: DiT,
+        given: Scene | None = None,
+        label_at: LabelAt | None = None,
+        seed: int = 0,
+        scene_index: int = 0,
+        num_inference_steps: int | None = None,
+        sketches: Sequence[SketchedRoad] = (),
+    ) -> None:
+        require_planner(planner)
+        self.planner, self.label_at, self.seed, self.scene_index = planner, label_at, seed, scene_index
+        self.sketches = tuple(sketches)
+        size = planner.config.size
+        self.window_grid = BlockGrid(size, size // 2, rank_outward, None)
+        # First pixels of the first window, counted ahead from x = 0 and to the left from y = 0.
+        self._first = -size // 2, -size // 2
+        self._given, self._is_given = np.zeros((CHANNELS, size, size), np.float32), np.zeros((size, size), bool)
+        if given is not None:
+            self._set_given(given)
+        self._windows: dict[BlockIndex, np.ndarray] = {}
+        sampler = SchedulerConfig.ddpm(planner.diffusion).with_sampler(SAMPLER)
+        steps = num_inference_steps or SAMPLERS[SAMPLER].num_inference_steps
+        planner.diffusion.select_timesteps(steps)  # Raises an error for an invalid number of steps.
+        self._scheduler: Any = sampler.build()
+        self._steps = steps
+
+    def _set_given(self, given: Scene) -> None:
+        """Put the given scene in the middle of the first window."""
+        distance_m = measure_street_distances(*read_street_masks(given), given.grid.resolution_m)
+        size, (rows, cols) = self.window_grid.size, distance_m.shape[1:]
+        back_px, right_px = given.grid.back_m / PIXEL_M, given.grid.right_m / PIXEL_M
+        if rows > size or cols > size or (size - rows) % 2 or (size - cols) % 2 or back_px % 1 or right_px % 1:
+            raise ValueError(
+                f"scene {given.scene_id} has {given.grid}; a street plan continues scenes of at most {self.window_m:g}"
+                f" m whose borders lie at multiples of {PIXEL_M:g} m"
+            )
+        row, col = (size - rows) // 2, (size - cols) // 2
+        self._first = round(back_px) - row, round(right_px) - col
+        middle = slice(row, row + rows), slice(col, col + cols)
+        self._given[:, *middle] = distance_m
+        # Distances that are independent of the surroundings of the scene.
+        self._is_given[middle] = (np.abs(distance_m) <= measure_border_distances(rows, cols)).all(axis=0)
+
+    @property
+    def window_m(self) -> float:
+        """Side of a window (m)."""
+        return self.window_grid.size * PIXEL_M
+
+    def _find_window_grid(self, index: BlockIndex) -> Grid:
+        """Return the grid of the pixels of a window."""
+        size, step = self.window_grid.size, self.window_grid.step
+        back, right = (first + k * step for first, k in zip(self._first, index, strict=True))
+        return Grid((back + size) * PIXEL_M, (right + size) * PIXEL_M, PIXEL_M, size, size)
+
+    def list_windows(self, grid: Grid) -> list[BlockIndex]:
+        """List the windows that overlap a grid.
+
+        Args:
+            grid: Grid in the frame of block (0, 0).
+
+        Returns:
+            Indices of the windows.
+        """
+        ranges = []
+        for first, low_m, high_m in zip(
+            self._first, (grid.back_m, grid.right_m), (grid.front_m, grid.left_m), strict=True
+        ):
+            # Window k spans pixels first + k step to first + k step + size.
+            low, high = low_m / PIXEL_M - first, high_m / PIXEL_M - first
+            start = int((low - self.window_grid.size) // self.window_grid.step) + 1
+            ranges.append(range(start, int(-(-high // self.window_grid.step))))
+        return list(product(*ranges))
+
+    def collect(self, grid: Grid) -> StreetDistances:
+        """Return the plan of a rectangle, and generate missing windows.
+
+        Args:
+            grid: Grid in the frame of block (0, 0), of any resolution.
+
+        Returns:
+            Distances on all pixels of the plan that are needed to draw the streets on the grid.
+        """
+        back, right = (int(low_m // PIXEL_M) - 1 for low_m in (grid.back_m, grid.right_m))
+        front, left = (int(-(-high_m // PIXEL_M)) + 1 for high_m in (grid.front_m, grid.left_m))
+        whole = Grid(front * PIXEL_M, left * PIXEL_M, PIXEL_M, front - back, left - right)
+        distance_m = np.full((CHANNELS, whole.rows, whole.cols), -REACH_M, np.float32)
+        for index in self.list_windows(whole):
+            owned = self.window_grid.owned_cells(index)
+            here, there = whole.intersect(self._find_window_grid(index))
+            if owned[there].any():
+                np.copyto(distance_m[:, *here], self.get_window(index)[:, *there], where=owned[there])
+        return StreetDistances(whole.front_m, whole.left_m, distance_m)
+
+    def draw(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the streets on a grid, and generate missing windows.
+
+        Args:
+            grid: Grid in the frame of block (0, 0).
+
+        Returns:
+            Masks (rows, cols) of the pixels of roads, and of roads and sidewalks.
+        """
+        return self.collect(grid).draw(grid)
+
+    def find_contradiction(self, scene: Scene) -> None:
+        """Return None: the plan continues the streets of the given scene.
+
+        Args:
+            scene: Given scene.
+        """
+        return
+
+    def get_window(self, index: BlockIndex) -> np.ndarray:
+        """Return the distances of a window; generate its missing predecessors and the window.
+
+        Args:
+            index: Index of the window (steps ahead, steps to the left).
+
+        Returns:
+            (2, size, size) float32 distances (m).
+        """
+        waiting = [index]  # A loop, because distant windows have thousands of predecessors.
+        while waiting:
+            needs = [other for other, _ in self.window_grid.known_cells(waiting[-1])]
+            if missing := [other for other in needs if other not in self._windows]:
+                waiting += missing
+                continue
+            last = waiting.pop()
+            if last not in self._windows:
+                self._windows[last] = self._generate_window(last)
+        return self._windows[index]
+
+    def _find_known(self, index: BlockIndex) -> tuple[np.ndarray, np.ndarray]:
+        """Return the known distances (2, size, size) of a window, and the mask (size, size) of the known pixels."""
+        size = self.window_grid.size
+        known_m, is_known = np.zeros((CHANNELS, size, size), np.float32), np.zeros((size, size), bool)
+        if index == (0, 0):
+            known_m, is_known = self._given.copy(), self._is_given.copy()
+        for other, cells in self.window_grid.known_cells(index):
+            here, there = self.window_grid.overlap_cells(index, other), self.window_grid.overlap_cells(other, index)
+            np.copyto(known_m[:, *here], self._windows[other][:, *there], where=cells[here])
+            is_known |= cells
+        if self.sketches:
+            grid = self._find_window_grid(index)
+            side = round(PIXEL_M / SKETCH_RESOLUTION_M)
+            fine = replace(grid, resolution_m=SKETCH_RESOLUTION_M, rows=grid.rows * side, cols=grid.cols * side)
+            road, sidewalk = draw_roads(self.sketches, fine)
+            sketched_m = measure_street_distances(road, road | sidewalk, SKETCH_RESOLUTION_M)
+            is_sketched = (sketched_m[0] >= 0) & ~is_known
+            np.copyto(known_m, sketched_m, where=is_sketched)
+            is_known |= is_sketched
+        return known_m, is_known
+
+    def _generate_window(self, index: BlockIndex) -> np.ndarray:
+        known_m, is_known = self._find_known(index)
+        if is_known.all():
+            return known_m
+        config, device = self.planner.config, self.planner.device
+        shift, scale = (
+            torch.tensor(value or [default] * CHANNELS, device=device)[:, None, None]
+            for value, default in ((config.shift, 0.0), (config.scale, 1.0))
+        )
+        grid = self._find_window_grid(index)
+        middle = (grid.front_m + grid.back_m) / 2, (grid.left_m + grid.right_m) / 2
+        name = self.label_at(*middle) if self.label_at else f"{ANY}-{ANY}-free"
+        label = torch.tensor([find_label_index(LABEL_KIND, name)], device=device)
+        known = (torch.from_numpy(known_m).to(device) - shift) / scale
+        mask = torch.from_numpy(~is_known).to(known).expand(1, CHANNELS, -1, -1)
+        condition = InpaintCondition(known[None], mask)
+        self._scheduler.set_timesteps(self._steps, device=device)
+        denoise = self.planner.precompute_conditioning(self._scheduler.timesteps.tolist(), label.tolist())
+        noise = SceneNoise(self.seed, [(self.scene_index, *index)], known.shape, device, PLAN)
+        model = with_known(denoise, condition, self.planner.diffusion)
+        latent: Tensor = sample_with_scheduler(model, self._scheduler, noise, label)
+        latent = torch.where(mask.bool(), latent, condition.latent)[0]
+        found_m = (latent * scale + shift).clamp(-REACH_M, REACH_M).cpu().numpy()
+        return np.where(is_known, known_m, found_m)
