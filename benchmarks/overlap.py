@@ -21,7 +21,8 @@ import torch
 import tyro
 from common import describe_machine
 
-from models.composition.outpaint import BlockComposer, BlockGrid, SceneBlock, find_ground_height
+from models.composition.block_grid import BlockGrid
+from models.composition.outpaint import BlockComposer, SceneBlock, find_ground_height
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.scene import Grid, Scene

@@ -54,7 +54,11 @@ class Config(RePaintOptions):
     0.5; default: outward for one block on each side, colours over longer distances, where outward drifts)."""
     margin: float | None = None
     """Width of the outermost part of a block that its neighbours generate again, as a share of the block size. It must
-    be less than half of --overlap (default: 0)."""
+    be less than half of --overlap (default: 0.0625 if all streets are known from a plan or a map, else 0)."""
+    plan_streets: bool | None = None
+    """Plan the streets of the whole result first, so that all blocks agree on them; the plan is written to
+    street_plans/ as a map for --road-sketch (default: if the model has a street planner and there is more than one
+    block on a side)."""
     labels_map: str = ""
     """JSON file with one list per row of blocks, farthest ahead first, each with one label per block, leftmost first;
     replaces --label."""

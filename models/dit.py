@@ -18,7 +18,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, Real
 from torch import Tensor, nn
 
-from models.base import ConfiguredModel, apply_in_float32, register_computed_buffers, register_to_config
+from models.base import apply_in_float32, register_computed_buffers, register_to_config
+from models.diffusion_model import DiffusionModel, make_noise_shares, parse_schedule, require_num_labels
 from models.labels import LABELS
 from models.layout import LayoutSpec
 from models.limits import require_within
@@ -43,11 +44,6 @@ RULES: dict[str, Rule] = {
     "scale": Sequential(Number(1e-6, LARGE), 1, MAX_CHANNELS),
     "prediction": Choice(get_args(Prediction)),
     "inpainting": Flag(),
-}
-SCHEDULE_RULES: dict[str, Rule] = {
-    "num_timesteps": Integer(1, 2**31),
-    "beta_start": Number(1e-9, 0.9999),
-    "beta_end": Number(1e-9, 0.9999),
 }
 
 
@@ -134,7 +130,7 @@ class DiTBlock(nn.Module):
         return torch.addcmul(x, gate2[:, None], self.mlp_out(F.gelu(self.mlp_in(y), approximate="tanh")))
 
 
-class DiT(ConfiguredModel):
+class DiT(DiffusionModel):
     """Predict the noise in latents (b, channels, size, size), conditioned on timestep and label.
 
     Args:
@@ -161,7 +157,6 @@ class DiT(ConfiguredModel):
     """
 
     positions: Tensor
-    noise_shares: Tensor
 
     @register_to_config
     def __init__(
@@ -201,11 +196,9 @@ class DiT(ConfiguredModel):
     def compute_buffers(self) -> dict[str, Tensor]:
         """Return the position embeddings, and per timestep the weights of the latent and of v in the noise."""
         require_within("model_buffers", self._rows**2 * self.patch_out.in_features, "positions of the patches")
-        require_within("model_timesteps", self._schedule.num_timesteps)
-        alpha_bar = torch.from_numpy(self._schedule.alpha_bar)
         return {
             "positions": make_sincos_positions(self._rows, self.patch_out.in_features),
-            "noise_shares": torch.stack([(1 - alpha_bar).sqrt(), alpha_bar.sqrt()], dim=1).float(),
+            "noise_shares": make_noise_shares(self._schedule),
         }
 
     @classmethod
@@ -240,21 +233,10 @@ class DiT(ConfiguredModel):
         for name in ("shift", "scale"):
             if name not in absent and len(config[name]) != config["channels"]:
                 raise ValueError(f"{name} has {len(config[name])} entries for {config['channels']} channels")
-        if config["num_labels"] != len(LABELS[config["label"]]):
-            raise ValueError(
-                f"num_labels is {config['num_labels']}, expected {len(LABELS[config['label']])}, the number of"
-                f" {config['label']} labels"
-            )
+        require_num_labels(config)
         if "layout" not in absent:
             LayoutSpec.from_dict(config["layout"])
-        schedule = config["schedule"]
-        if not isinstance(schedule, Diffusion):
-            check_entries(schedule, SCHEDULE_RULES, "schedule")
-            require_within("model_timesteps", schedule.get("num_timesteps", 1), "schedule.num_timesteps")
-            schedule = Diffusion(**schedule)
-        if schedule.beta_start > schedule.beta_end:
-            raise ValueError(f"schedule.beta_start is {schedule.beta_start}, above beta_end {schedule.beta_end}")
-        return config | {"schedule": schedule}
+        return config | {"schedule": parse_schedule(config["schedule"])}
 
     def init_weights(self) -> None:
         """Initialise the weights as in DiT: zeros for the output and every residual branch, Xavier elsewhere."""
@@ -276,16 +258,6 @@ class DiT(ConfiguredModel):
     def list_modulations(self) -> list[nn.Linear]:
         """Return the layers that map the condition to modulations: one layer per block, then the output layer."""
         return [*(cast(DiTBlock, block).modulation for block in self.blocks), self.modulation]
-
-    @property
-    def diffusion(self) -> Diffusion:
-        """Noise schedule of the training."""
-        return Diffusion(**self.config.schedule)
-
-    @property
-    def null_label(self) -> int:
-        """Index of the null label."""
-        return self.config.num_labels
 
     def condition(self, timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]) -> Float[Tensor, "batch d"]:
         """Compute the condition that modulates every block: SiLU(timestep embedding + label embedding).
@@ -314,22 +286,6 @@ class DiT(ConfiguredModel):
         """
         condition = self.condition(timestep, label)
         return [*(layer(condition) for layer in self.list_modulations()), self.noise_shares[timestep]]
-
-    def loss_weight(self, timestep: Int[Tensor, " batch"]) -> Float[Tensor, " batch"]:
-        """Return the weight of the squared noise error in the training loss.
-
-        The weight is chosen such that the squared error of the network output (noise or v) has weight 1 at every
-        timestep.
-
-        Args:
-            timestep: Timesteps.
-
-        Returns:
-            One weight per sample.
-        """
-        if self.config.prediction == "epsilon":
-            return torch.ones(len(timestep), device=timestep.device)
-        return self.noise_shares[timestep, 1] ** -2
 
     def forward(
         self, latent: Float[Tensor, "batch c_in h w"], timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]

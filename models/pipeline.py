@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -22,13 +22,14 @@ from models.composition.attachments import (
     decode_with_spare_poles,
     resolve_attachments,
 )
+from models.composition.block_grid import BlockIndex, choose_arrangement, label_blocks
 from models.composition.deduplicate import find_lower_confidence_duplicates
 from models.composition.extend import Side, extend_scene
 from models.composition.generator import StepCallback
 from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
-from models.composition.outpaint import BlockIndex, choose_arrangement, label_blocks, outpaint_scene
-from models.composition.road_sketch import RoadMap, SketchedRoad
-from models.composition.street_plan import require_planner
+from models.composition.outpaint import outpaint_scene, uses_street_plan
+from models.composition.road_sketch import RoadMap, SketchedRoad, Streets
+from models.composition.street_plan import StreetPlan, convert_label
 from models.dit import DiT
 from models.execution import SamplingExecution
 from models.labels import FREE, find_label_index, split_label
@@ -65,10 +66,11 @@ from models.sampling.repaint import (
 )
 from models.sampling.schedulers import SAMPLERS, SchedulerConfig
 from models.scene import Scene
+from models.street_planner import StreetPlanner
 from models.tensors import EXISTENCE_THRESHOLD, make_empty_scene, make_layout_batch
 
 COMPONENTS = {"lvae": LayoutVAE, "dit": DiT}
-STREET_PLANNER = "street_planner"  # Name of an optional component, a DiT for street plans.
+STREET_PLANNER = "street_planner"  # Name of an optional component.
 NEIGHBOUR_LATENTS = ("reencode", "copy", "paper")
 SCHEDULER_CONFIG = "scheduler/scheduler_config.json"
 MAX_PAG_SCALE = 20.0
@@ -158,8 +160,8 @@ class PrITTIPipeline:
             do not follow a plan, as in the paper.
 
     Raises:
-        ValueError: The LayoutSpec or the shape of the latents of the DiT differs from that of `lvae`, the noise
-            schedule of the scheduler from that of the DiT, or `street_planner` plans no streets.
+        ValueError: The LayoutSpec or the shape of the latents of the DiT differs from that of `lvae`, or the
+            noise schedule of the scheduler from that of the DiT.
     """
 
     def __init__(
@@ -174,12 +176,11 @@ class PrITTIPipeline:
         attach: bool = True,
         pag_scale: float = 0.0,
         num_inference_steps: int = NUM_INFERENCE_STEPS,
-        street_planner: DiT | None = None,
+        street_planner: StreetPlanner | None = None,
     ) -> None:
         self.lvae, self.dit = lvae.eval().requires_grad_(False), dit.eval().requires_grad_(False)
-        self.street_planner: DiT | None = None
+        self.street_planner: StreetPlanner | None = None
         if street_planner is not None:
-            require_planner(street_planner)
             self.street_planner = street_planner.eval().requires_grad_(False)
         self.scheduler = SchedulerConfig.ddpm(dit.diffusion)
         if scheduler is not None:
@@ -223,7 +224,7 @@ class PrITTIPipeline:
         """
         path = Path(find_pipeline_path(directory))
         index = read_config(path / INDEX_NAME, cls.__name__)
-        kinds = COMPONENTS | ({STREET_PLANNER: DiT} if STREET_PLANNER in index else {})
+        kinds = COMPONENTS | ({STREET_PLANNER: StreetPlanner} if STREET_PLANNER in index else {})
         for name, kind in kinds.items():
             if index.get(name) != (expected := [kind.__module__, kind.__name__]):
                 raise ValueError(f"{path / INDEX_NAME}: {name} is {show_value(index.get(name))}, expected {expected}")
@@ -261,7 +262,7 @@ class PrITTIPipeline:
         scheduler = path / SCHEDULER_CONFIG
         scheduler.parent.mkdir(exist_ok=True)
         write_config(self.scheduler_config.class_name, self.scheduler_config.config, scheduler)
-        kinds = COMPONENTS | ({} if self.street_planner is None else {STREET_PLANNER: DiT})
+        kinds = COMPONENTS | ({} if self.street_planner is None else {STREET_PLANNER: StreetPlanner})
         index = {name: [kind.__module__, kind.__name__] for name, kind in kinds.items()}
         index["scheduler"] = ["diffusers", self.scheduler_config.class_name]
         write_config(type(self).__name__, index | self.config, path / INDEX_NAME)
@@ -979,8 +980,9 @@ class PrITTIPipeline:
         side: Side | None = None,
         order: str | None = None,
         free_blocks: str | None = None,
-        roads: Sequence[SketchedRoad | RoadMap] = (),
+        roads: Sequence[Streets] = (),
         margin: float | None = None,
+        plan_streets: bool | None = None,
     ) -> Scene:
         """Extend a scene by generated blocks; the input content is unchanged (paper, supplement B.3).
 
@@ -1009,13 +1011,15 @@ class PrITTIPipeline:
             roads: Roads that the generated blocks contain, in the frame of the scene; ignored with `side`.
             margin: Width of the outermost part of a block that its neighbours generate again, as a fraction of a block;
                 None: see `choose_arrangement`.
+            plan_streets: Whether streets are planned before blocks; None: if the model can do this and there is more
+                than one block on a side (`models.composition.outpaint.uses_street_plan`). Ignored with `side`.
 
         Returns:
             One scene that covers all blocks.
 
         Raises:
-            ValueError: The scene does not fit the model, the overlap is not a whole number of cells, or a road
-                contradicts the ground of the scene.
+            ValueError: The scene does not fit the model, the overlap is not a whole number of cells, a road contradicts
+                the ground of the scene, or the model cannot plan streets.
         """
         if side is not None:
             if not isinstance(label, str):
@@ -1023,7 +1027,10 @@ class PrITTIPipeline:
             share = 0.5 if overlap is None else overlap
             return extend_scene(self, scene, side, label, seed, share, repaint, guidance_scale, callback_on_step_end)
         self.require_grid(scene)
-        arrangement = choose_arrangement(num_blocks, order, overlap, free_blocks, margin)
+        mode = str(mode or self.config.neighbour_latents)
+        has_plan = uses_street_plan(self, roads, mode, max(num_blocks) > 1, plan_streets)
+        has_map = any(isinstance(one, RoadMap) for one in roads)
+        arrangement = choose_arrangement(num_blocks, order, overlap, free_blocks, margin, has_plan or has_map)
         if isinstance(label, str):
             label = label_blocks(self.dit.config.label, label, num_blocks, arrangement.free_blocks)
         return outpaint_scene(
@@ -1033,13 +1040,51 @@ class PrITTIPipeline:
             seed,
             index,
             arrangement,
-            mode or self.config.neighbour_latents,
+            mode,
             num_blocks,
             repaint,
             guidance_scale,
             callback_on_step_end,
             roads,
+            has_plan,
         )
+
+    @property
+    def plans_streets(self) -> bool:
+        """True if the pipeline has a street planner."""
+        return self.street_planner is not None
+
+    def plan_streets(
+        self,
+        scene: Scene | None,
+        label_at: Callable[[float, float], str],
+        seed: int = 0,
+        index: int = 0,
+        sketches: Sequence[SketchedRoad] = (),
+    ) -> StreetPlan:
+        """Plan the streets around a scene over any distance, before blocks are generated.
+
+        Args:
+            scene: Scene that the plan continues; None: the plan starts from nothing.
+            label_at: Function that maps x and y (m, frame of the scene) to the label of the block there.
+            seed: Seed of the noise.
+            index: Index of the scene; the noise depends on the seed and this index.
+            sketches: Sketched roads that the plan contains, in the frame of the scene.
+
+        Returns:
+            The plan, which generates its windows on demand.
+
+        Raises:
+            ValueError: The pipeline has no street planner, or the scene has other ground classes or another grid.
+        """
+        if self.street_planner is None:
+            raise ValueError("this pipeline has no street planner; add one with train_street_planner.py")
+        kind = self.dit.config.label
+
+        def convert(x_m: float, y_m: float) -> str:
+            return convert_label(kind, label_at(x_m, y_m))
+
+        return StreetPlan(self.street_planner, scene, convert, seed, index, sketches=sketches)
 
     def require_grid(self, scene: Scene) -> None:
         """Raise an error if the grid or the ground classes of a scene differ from those of the model.

@@ -169,10 +169,11 @@ class DiTPreset:
 
 @dataclass(frozen=True)
 class StreetPlannerPreset:
-    """Architecture and training options of a street planner (models/composition/street_plan.py).
+    """Architecture and training options of a street planner (models/street_planner.py).
 
     Attributes:
-        model: Architecture.
+        widths: Number of channels of each level of the U-Net.
+        layers: Number of residual layers per level.
         batch_size: Samples per step.
         steps: Number of training steps.
         num_maps: Number of street maps for training.
@@ -184,7 +185,8 @@ class StreetPlannerPreset:
         label_dropout: Probability that a training sample gets the null label.
     """
 
-    model: DiTConfig
+    widths: tuple[int, ...]
+    layers: int
     batch_size: int
     steps: int
     num_maps: int
@@ -196,8 +198,8 @@ class StreetPlannerPreset:
     label_dropout: float = 0.1
 
     def architecture(self) -> dict:
-        """Return all keyword arguments of `DiT` except those that depend on the street maps."""
-        return {field.name: getattr(self.model, field.name) for field in fields(self.model)}
+        """Return the keyword arguments of `StreetPlanner` that determine its size."""
+        return {"widths": list(self.widths), "layers": self.layers}
 
 
 SMALL_DIT = DiTConfig(2, 6, 256, 4, prediction="v_prediction")
@@ -224,8 +226,8 @@ DIT_PRESETS: dict[str, DiTPreset] = {
 
 
 STREET_PLANNER_PRESETS: dict[str, StreetPlannerPreset] = {
-    "smoke": StreetPlannerPreset(DiTConfig(8, 1, 32, 2, "v_prediction", True), 4, 8, 4, 4, warmup_steps=0),
-    "town": StreetPlannerPreset(DiTConfig(4, 6, 192, 6, "v_prediction", True), 32, 10_000, 8_000, 400),
+    "smoke": StreetPlannerPreset((32, 32), 1, 4, 8, 4, 4, warmup_steps=0),
+    "town": StreetPlannerPreset((64, 128, 192), 1, 16, 5_000, 8_000, 400, 6e-4),
 }
 
 

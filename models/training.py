@@ -26,7 +26,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from models.base import ConfiguredModel
 from models.batch import LayoutBatch
-from models.composition.street_distances import measure_border_distances
+from models.composition.street_distances import PIXEL_M, SCENE_M, measure_border_distances
+from models.diffusion_model import DiffusionModel
 from models.dit import DiT
 from models.execution import require_bf16
 from models.labels import PART_DROPOUT, list_dropped_labels
@@ -46,6 +47,7 @@ from models.sampling.known_regions import (
     make_street_masks,
     make_training_masks,
 )
+from models.street_planner import CHANNELS, StreetPlanner
 from models.vae.losses import compute_lvae_loss
 from models.vae.matching import NonFiniteCostError
 
@@ -335,7 +337,9 @@ def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, nu
     return (uniform * num_timesteps).long().clamp(max=num_timesteps - 1)
 
 
-def compute_loss_weight(dit: DiT, timestep: Int[Tensor, " b"], weighting: LossWeighting) -> Float[Tensor, " b"]:
+def compute_loss_weight(
+    dit: DiffusionModel, timestep: Int[Tensor, " b"], weighting: LossWeighting
+) -> Float[Tensor, " b"]:
     """Return the weight of the squared noise error in the training loss.
 
     The paper uses "uniform": the squared error of the network output has the same weight at every timestep. "min_snr"
@@ -365,17 +369,16 @@ class DiffusionLossConfig:
         loss_weighting: Weighting of the timesteps (`compute_loss_weight`).
         sample_posterior: Whether each step draws latents from the posteriors of the layout VAE. If False, the latents
             are the means of the posteriors.
-        scene_px: Side of a scene in pixels of a street plan, if the network is a street planner
-            (`models.composition.street_plan`). None: the network is that of stage 2.
     """
 
     timestep_sampling: TimestepSampling = "uniform"
     loss_weighting: LossWeighting = "uniform"
     sample_posterior: bool = True
-    scene_px: int | None = None
 
 
-def make_diffusion_loss(dit: DiT, label_dropout: float, config: DiffusionLossConfig | None = None) -> LossFunction:
+def make_diffusion_loss(
+    dit: DiT | StreetPlanner, label_dropout: float, config: DiffusionLossConfig | None = None
+) -> LossFunction:
     """Return the loss function of stage 2 (training of the DiT): mean squared error of the noise (Eq. "LDM").
 
     With v-prediction, the error is weighted (`compute_loss_weight`). Labels are dropped once per sample. Before, a
@@ -392,17 +395,19 @@ def make_diffusion_loss(dit: DiT, label_dropout: float, config: DiffusionLossCon
     """
     config = config or DiffusionLossConfig()
     diffusion = dit.diffusion
-    shape = (dit.config.channels, dit.config.size, dit.config.size)
+    is_planner = isinstance(dit, StreetPlanner)
+    shape = (CHANNELS if is_planner else dit.config.channels, dit.config.size, dit.config.size)
     shift = torch.tensor(dit.config.shift or [0.0] * shape[0], device=dit.device)[:, None, None]
     scale = torch.tensor(dit.config.scale or [1.0] * shape[0], device=dit.device)[:, None, None]
     parts = list_dropped_labels(dit.config.label)
     remaining = None if parts is None else torch.tensor(parts, device=dit.device)
-    inpainting = dit.config.inpainting
+    inpainting = is_planner or dit.config.inpainting
     border_m = torch.zeros(shape[1:], device=dit.device)
-    if config.scene_px is not None:
-        inside = slice((shape[1] - config.scene_px) // 2, (shape[1] + config.scene_px) // 2)
-        border_m[inside, inside] = torch.from_numpy(measure_border_distances(config.scene_px, config.scene_px)).float()
-    num_mask = 0 if not inpainting else NUM_UNIFORM if config.scene_px is None else NUM_STREET_UNIFORM
+    if is_planner:
+        side = round(SCENE_M / PIXEL_M)
+        inside = slice((shape[1] - side) // 2, (shape[1] + side) // 2)
+        border_m[inside, inside] = torch.from_numpy(measure_border_distances(side, side)).float()
+    num_mask = 0 if not inpainting else NUM_STREET_UNIFORM if is_planner else NUM_UNIFORM
 
     def loss(
         model: Callable[..., Any], arrays: dict[str, Tensor], generators: list[torch.Generator]
@@ -423,9 +428,9 @@ def make_diffusion_loss(dit: DiT, label_dropout: float, config: DiffusionLossCon
         noisy = diffusion.add_noise(latent, noise, timestep)
         if inpainting:
             mask = (
-                make_training_masks(uniform[:, count:], shape[0], shape[1])
-                if config.scene_px is None
-                else make_street_masks(uniform[:, count:], mean, border_m)
+                make_street_masks(uniform[:, count:], mean, border_m)
+                if is_planner
+                else make_training_masks(uniform[:, count:], shape[0], shape[1])
             )
             noisy = join_known(noisy, InpaintCondition(latent, mask))
         error = F.mse_loss(model(noisy, timestep, label).float(), noise, reduction="none")
@@ -676,7 +681,7 @@ def make_lvae_trainer(
 
 
 def make_dit_trainer(
-    model: DiT,
+    model: DiT | StreetPlanner,
     settings: OptimizerConfig,
     label_dropout: float,
     device: torch.device,
@@ -684,7 +689,7 @@ def make_dit_trainer(
     execution: ExecutionConfig | None = None,
     loss_config: DiffusionLossConfig | None = None,
 ) -> Trainer:
-    """Return a trainer of a diffusion transformer.
+    """Return a trainer of a diffusion transformer, or of a street planner, which is not compiled.
 
     Args:
         model: Model; it is moved to `device`.
@@ -701,7 +706,7 @@ def make_dit_trainer(
     execution = execution or ExecutionConfig()
     model = model.to(device)
     loss = make_diffusion_loss(model, label_dropout, loss_config)
-    if execution.compile:
+    if execution.compile and isinstance(model, DiT):
         for block in model.blocks:  # All blocks share the compiled code.
             block.compile(dynamic=False)
     return Trainer(model, loss, settings, device, wrap(model), execution)

@@ -17,7 +17,8 @@ from jobs.support.model_directories import find_pipeline_directory, read_label_k
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import make_execution, make_inpainting_config, select_scenes
-from models.composition.outpaint import MIN_KNOWN_GROUND, Arrangement, choose_arrangement, label_blocks
+from models.composition.block_grid import Arrangement, choose_arrangement, label_blocks
+from models.composition.outpaint import MIN_KNOWN_GROUND
 from models.composition.road_sketch import RoadMap, SketchedRoad
 from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
 from pipelines.runtime import storage
@@ -139,7 +140,8 @@ def outpaint(config: Config) -> list[str]:
         roads=read_road_sketch(config.road_sketch, config.sketch_pixel_m) if config.road_sketch else (),
         seed=config.seed,
         overlap=arrangement.overlap,
-        margin=arrangement.margin,
+        margin=config.margin,
+        plan_streets=config.plan_streets,
         mode=config.neighbour_latents,
         repaint=make_inpainting_config(config, model),
         execution=make_execution(config),

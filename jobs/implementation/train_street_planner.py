@@ -21,11 +21,8 @@ from jobs.support.ray_session import start_ray
 from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun
 from jobs.train_street_planner import Config
-from models.composition.street_distances import CHANNELS, PIXEL_M
-from models.composition.street_plan import LABEL_KIND
-from models.dit import DiT
-from models.labels import LABELS
 from models.presets import STREET_PLANNER_PRESETS, StreetPlannerPreset, find_preset
+from models.street_planner import StreetPlanner
 from models.training import DiffusionLossConfig, ExecutionConfig, OptimizerConfig, Trainer, Wrap, make_dit_trainer
 from pipelines.generation.sample import load_pipeline
 from pipelines.preprocess.street_maps import MAP_PX, compute_map_thresholds, make_street_maps, plan_street_maps
@@ -34,8 +31,6 @@ from pipelines.schema.tables import Shard
 from pipelines.training.data_loader import Stream
 from pipelines.training.latents import digest_weights
 from pipelines.training.street_map_reader import StreetMapReader
-
-SCENE_M = 64.0  # Side of the given scene in the middle of a street plan.
 
 
 def prepare(config: Config) -> TrainingRun:
@@ -77,7 +72,7 @@ def prepare(config: Config) -> TrainingRun:
     name = find_run_name(config)
     record = trainer.guard_run_name(name, home_path("runs"), identity)
     tracker = Tracker.start("pritti-streets", name, identity | {"architecture": row.architecture()}, record)
-    loss_config = DiffusionLossConfig(sample_posterior=False, scene_px=round(SCENE_M / PIXEL_M))
+    loss_config = DiffusionLossConfig(sample_posterior=False)
     execution = ExecutionConfig(precision=config.precision)
     state = start and start.state_dict()
     return TrainingRun(
@@ -127,17 +122,13 @@ def make_architecture(row: StreetPlannerPreset, reader: StreetMapReader, shard: 
     first = shard.read("street_maps", ["map_id"]).num_rows
     distance_m = replace(reader, seed=None)(shard, np.arange(first))["mean"].astype(np.float64)
     return row.architecture() | {
-        "channels": CHANNELS,
         "size": MAP_PX,
-        "label": LABEL_KIND,
-        "num_labels": len(LABELS[LABEL_KIND]),
-        "layout": None,
         "shift": distance_m.mean(axis=(0, 2, 3)).tolist(),
         "scale": distance_m.std(axis=(0, 2, 3)).tolist(),
     }
 
 
-def load_start(model: str, row: StreetPlannerPreset) -> DiT:
+def load_start(model: str, row: StreetPlannerPreset) -> StreetPlanner:
     """Return the street planner of a pipeline.
 
     Raises:
@@ -167,7 +158,7 @@ def build(
 ) -> Trainer:
     """Return the Trainer, with the same initial weights on every worker."""
     torch.manual_seed(settings.seed)
-    model = DiT(**architecture)
+    model = StreetPlanner(**architecture)
     if start:
         model.load_state_dict(start)
     return make_dit_trainer(model, settings, label_dropout, device, wrap, execution, loss_config)
@@ -197,7 +188,7 @@ def complete_pipeline(model: str, output: str) -> str:
         output: Directory that contains street_planner/. This directory is also returned.
     """
     pipeline = load_pipeline(model)
-    pipeline.register_modules(street_planner=DiT.from_pretrained(storage.join_uri(output, "street_planner")))
+    pipeline.register_modules(street_planner=StreetPlanner.from_pretrained(storage.join_uri(output, "street_planner")))
     with tempfile.TemporaryDirectory() as directory:
         pipeline.save_pretrained(directory)
         publish_directory(directory, output)

@@ -16,6 +16,7 @@ from models.dit import DiT
 from models.lvae import LayoutVAE
 from models.sampling.diffusion import Diffusion, SamplingSchedule, SceneNoise, make_keyed_generator, sample
 from models.scene import Grid, Scene
+from models.street_planner import StreetPlanner
 from models.tensors import decode_layout, make_layout_batch
 from models.training import Trainer, sample_noise
 from models.vae.accuracy import compute_accuracy, join_pairs, pair_primitives
@@ -154,7 +155,7 @@ class StreetPlanCheck:
     @torch.no_grad()
     def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Return the validation loss, the share of road in the largest connected part of a plan, and its picture."""
-        planner = cast(DiT, trainer.ema_model().eval())
+        planner = cast(StreetPlanner, trainer.ema_model().eval())
         rows = np.arange(min(self.count, self.shards[0].read("street_maps", ["map_id"]).num_rows))
         arrays = {name: torch.from_numpy(v).to(trainer.device) for name, v in self.reader(self.shards[0], rows).items()}
         loss = float(trainer.loss(planner, arrays, [make_keyed_generator(1, k) for k in rows.tolist()])["loss"])

@@ -8,9 +8,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from models.composition.block_grid import BlockGrid
 from models.composition.generator import SceneGenerator, StepCallback
 from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
-from models.composition.outpaint import BlockGrid, find_ground_height
+from models.composition.outpaint import find_ground_height
 from models.composition.seam_blending import extract_new_part, extrapolate_ground
 from models.sampling.diffusion import OUTPAINT, InpaintCondition
 from models.sampling.repaint import InpaintingConfig

@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from models.composition.inpaint import Contents
+from models.composition.road_sketch import SketchedRoad, Streets
 from models.layout import LayoutSpec
 from models.sampling.diffusion import InpaintCondition, SceneKey
 from models.sampling.repaint import InpaintingConfig
@@ -35,6 +36,33 @@ class SceneGenerator(Protocol):
     @property
     def has_split_latent(self) -> bool:
         """True if the first half of the channels of a latent belongs to the ground, the second half to the objects."""
+        ...
+
+    @property
+    def plans_streets(self) -> bool:
+        """True if the model can plan streets."""
+        ...
+
+    def plan_streets(
+        self,
+        scene: Scene,
+        label_at: Callable[[float, float], str],
+        seed: int = 0,
+        index: int = 0,
+        sketches: Sequence[SketchedRoad] = (),
+    ) -> Streets:
+        """Plan the streets around a scene (see `PrITTIPipeline.plan_streets`).
+
+        Args:
+            scene: Scene that the plan continues.
+            label_at: Function that maps x and y (m, frame of the scene) to the label of the block there.
+            seed: Seed of the noise.
+            index: Index of the scene; the noise depends on the seed and this index.
+            sketches: Sketched roads that the plan contains.
+
+        Returns:
+            The plan.
+        """
         ...
 
     @property

@@ -6,18 +6,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from models.composition.block_grid import BlockGrid, BlockIndex, choose_arrangement, find_rank
 from models.composition.generator import SceneGenerator
 from models.composition.outpaint import (
     BlockComposer,
-    BlockGrid,
-    BlockIndex,
     SceneBlock,
     check_roads,
     find_ground_height,
-    find_rank,
     generate_blocks,
+    list_sketches,
+    make_label_finder,
+    uses_street_plan,
 )
-from models.composition.road_sketch import RoadMap, SketchedRoad
+from models.composition.road_sketch import RoadMap, Streets
 from models.sampling.repaint import InpaintingConfig
 from models.scene import Grid, Scene
 
@@ -44,7 +45,9 @@ class InfiniteScene:
             channels for ground and objects.
         order: Order of the blocks, a key of RANKS. With "colours", each block depends on at most eight neighbours and
             on block (0, 0). With "outward", it depends on all blocks of a rectangle with block (0, 0).
-        margin: Width of the margin of blocks as a fraction of a block (`outpaint.BlockGrid`).
+        margin: Width of the margin of blocks as a fraction of a block; None: see `block_grid.choose_arrangement`.
+        plan_streets: Whether streets are planned before blocks; None: if the model can do this
+            (`outpaint.uses_street_plan`).
 
     Raises:
         ValueError: The order or the label is unknown, the overlap is 0.5 or more with "colours", or the model cannot
@@ -62,18 +65,23 @@ class InfiniteScene:
         guidance_scale: float = 1.0,
         scene: Scene | None = None,
         scene_index: int = 0,
-        roads: Sequence[SketchedRoad | RoadMap] = (),
+        roads: Sequence[Streets] = (),
         order: str = "colours",
-        margin: float = 0.0,
+        margin: float | None = None,
+        plan_streets: bool | None = None,
     ) -> None:
         self.model, self.label, self.seed, self.scene_index = model, label, seed, scene_index
         self.options: dict[str, Any] = {"mode": mode, "repaint": repaint, "guidance_scale": guidance_scale}
+        self.plans_streets = uses_street_plan(model, roads, mode, True, plan_streets)
+        has_plan = self.plans_streets or any(isinstance(one, RoadMap) for one in roads)
+        margin = choose_arrangement((2, 2, 2, 2), order, overlap, None, margin, has_plan).margin
         block_grid = BlockGrid.from_overlap(
             model.latent_shape[-1], overlap, margin, rank=find_rank(order), num_blocks=None
         )
         self.composer = BlockComposer(block_grid, model.spec, model.encode, roads=roads)
         self.blocks: dict[BlockIndex, SceneBlock] = {}
-        self.scene = scene
+        self.scene, self.roads = scene, roads
+        self.plan: Streets | None = None
         model.label_tensor([self.label_of((0, 0))])
         given = scene or model.new_identity("city", seed, 0, self.label_of((0, 0)))
         check_roads(roads, given, mode, model.has_split_latent)
@@ -116,7 +124,13 @@ class InfiniteScene:
             self.blocks[index] = SceneBlock(self.scene, self.model.encode([self.scene])[0])
             return
         if known:
-            self.composer.level_m = find_ground_height(self.blocks[0, 0].scene, 0.0, 0.0)
+            first = self.blocks[0, 0].scene
+            self.composer.level_m = find_ground_height(first, 0.0, 0.0)
+            if self.plans_streets and self.plan is None:
+                label_at = make_label_finder(self.label, self.composer.step_m, first.grid)
+                sketches = list_sketches(self.roads)
+                plan = self.model.plan_streets(first, label_at, self.seed, self.scene_index, sketches)
+                self.plan, self.composer.roads = plan, [*self.roads, plan]
         label = self.label_of(index)
         like = self.model.new_identity("city", self.seed, 0, label)
         # Generate one block at a time. Rounding differs between batch sizes. If blocks were generated in batches, the

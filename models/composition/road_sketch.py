@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
@@ -18,6 +19,32 @@ ROAD, SIDEWALK, TERRAIN = "road", "sidewalk", "terrain"
 SAMPLING_M = 0.5  # Distance between the points at which a sketch is compared with given ground.
 CORE_M = 1.5  # Pixels of a map that lie deeper inside of a road are compared with given ground.
 MAX_CONTRADICTION = 0.05  # Largest share of these pixels that may lie on other ground of the given scene.
+
+
+class Streets(Protocol):
+    """Streets that outpainting takes as known ground: a sketched road, a map or a plan."""
+
+    def draw(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the streets on a grid.
+
+        Args:
+            grid: Grid in the frame of block (0, 0).
+
+        Returns:
+            Masks (rows, cols) of the pixels of roads, and of roads and sidewalks.
+        """
+        ...
+
+    def find_contradiction(self, scene: Scene) -> tuple[float, float, str] | None:
+        """Find a point of the streets on given ground of another class.
+
+        Args:
+            scene: Given scene, in the frame of block (0, 0).
+
+        Returns:
+            x and y of such a point (m), and the class of the ground; None if there is no such point.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -209,7 +236,7 @@ def _find_other_ground(scene: Scene, x_m: np.ndarray, y_m: np.ndarray) -> list[t
     return [(float(x), float(y), name) for x, y, name in zip(x_m[is_other], y_m[is_other], names, strict=True)]
 
 
-def draw_roads(roads: Sequence[SketchedRoad | RoadMap], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def draw_roads(roads: Sequence[Streets], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Draw roads on a grid.
 
     Args:
@@ -229,7 +256,7 @@ def draw_roads(roads: Sequence[SketchedRoad | RoadMap], grid: Grid) -> tuple[np.
 
 def add_sketched_ground(
     scene: Scene,
-    roads: Sequence[SketchedRoad | RoadMap],
+    roads: Sequence[Streets],
     where: np.ndarray,
     offset_m: tuple[float, float],
     level_m: float,
@@ -270,7 +297,7 @@ def add_sketched_ground(
     return replace(scene, occupied=occupied, height_m=height_m), drawn
 
 
-def check_sketch(roads: Sequence[SketchedRoad | RoadMap], scene: Scene) -> None:
+def check_sketch(roads: Sequence[Streets], scene: Scene) -> None:
     """Check that roads do not contradict the ground of the given scene.
 
     Args:

@@ -17,7 +17,7 @@ from models.scene import Grid, Scene
 
 PIXEL_M = 4.0  # Side of a pixel of a street plan.
 REACH_M = 8.0  # Distances are clipped to this length.
-CHANNELS = 2  # Distance to the border of the roads, and to the border of the paved area.
+SCENE_M = 64.0  # Side of the scenes that street plans continue.
 
 
 def measure_street_distances(road: np.ndarray, paved: np.ndarray, resolution_m: float) -> np.ndarray:

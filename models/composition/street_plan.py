@@ -1,6 +1,6 @@
 """Plan the streets of a city with a diffusion model, before its blocks are generated.
 
-Blocks that do not know each other cannot agree on streets. A street planner is a small `models.dit.DiT` for signed
+Blocks that do not know each other cannot agree on streets. A street planner (models/street_planner.py) generates signed
 distances (street_distances.py) over windows of 256 m. It continues known parts. The first window knows the streets of
 the given scene. Each further window knows those of its predecessors, which cover half of a window on the axes through
 the first window, and three quarters elsewhere. Blocks then take the plan as known ground, like a map of all roads.
@@ -17,10 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.composition.outpaint import BlockGrid, BlockIndex, rank_outward
+from models.composition.block_grid import BlockGrid, BlockIndex, rank_outward
 from models.composition.road_sketch import SketchedRoad, draw_roads
 from models.composition.street_distances import (
-    CHANNELS,
     PIXEL_M,
     REACH_M,
     StreetDistances,
@@ -28,34 +27,15 @@ from models.composition.street_distances import (
     measure_street_distances,
     read_street_masks,
 )
-from models.dit import DiT
 from models.labels import ANY, compose_label, find_label_index, split_label
 from models.sampling.diffusion import PLAN, InpaintCondition, SceneNoise, sample_with_scheduler, with_known
 from models.sampling.schedulers import SAMPLERS, SchedulerConfig
 from models.scene import Grid, Scene
+from models.street_planner import CHANNELS, LABEL_KIND, StreetPlanner
 
 SAMPLER = "dpm++"
-LABEL_KIND = "partial"  # Kind of label of a street planner: densities of vegetation and vehicles, or any.
 SKETCH_RESOLUTION_M = 0.5  # Side of the pixels from which the distances of sketched roads are computed.
 LabelAt = Callable[[float, float], str]  # Maps x and y (m, frame of block (0, 0)) to the label of the block there.
-
-
-def require_planner(planner: DiT) -> None:
-    """Check that a network is a street planner.
-
-    Args:
-        planner: Network.
-
-    Raises:
-        ValueError: The network generates no street plans, or cannot continue them.
-    """
-    config = planner.config
-    if config.channels != CHANNELS or not config.inpainting or config.label != LABEL_KIND or config.size % 2:
-        raise ValueError(
-            f"a street planner has {CHANNELS} channels, an even size, inpainting and {LABEL_KIND} labels; this network"
-            f" has {config.channels} channels, size {config.size}, inpainting {config.inpainting} and {config.label}"
-            " labels"
-        )
 
 
 def convert_label(kind: str, label: str) -> str:
@@ -74,6 +54,9 @@ def convert_label(kind: str, label: str) -> str:
 class StreetPlan:
     """An unbounded street plan that generates windows on demand. It does not depend on the order of requests.
 
+    Attributes:
+        windows: Distances (2, size, size) of the generated windows, by index (m).
+
     Args:
         planner: Street planner.
         given: Scene that the plan continues. Its grid must consist of whole pixels of the plan. None: nothing is given,
@@ -85,12 +68,12 @@ class StreetPlan:
         sketches: Sketched roads that the plan contains, in the frame of the given scene.
 
     Raises:
-        ValueError: The network is no street planner, or the scene has no roads and sidewalks or another grid.
+        ValueError: The scene has no roads and sidewalks, or a grid that a plan cannot continue.
     """
 
     def __init__(
         self,
-        planner: DiT,
+        planner: StreetPlanner,
         given: Scene | None = None,
         label_at: LabelAt | None = None,
         seed: int = 0,
@@ -98,7 +81,6 @@ class StreetPlan:
         num_inference_steps: int | None = None,
         sketches: Sequence[SketchedRoad] = (),
     ) -> None:
-        require_planner(planner)
         self.planner, self.label_at, self.seed, self.scene_index = planner, label_at, seed, scene_index
         self.sketches = tuple(sketches)
         size = planner.config.size
@@ -108,7 +90,8 @@ class StreetPlan:
         self._given, self._is_given = np.zeros((CHANNELS, size, size), np.float32), np.zeros((size, size), bool)
         if given is not None:
             self._set_given(given)
-        self._windows: dict[BlockIndex, np.ndarray] = {}
+        self.windows: dict[BlockIndex, np.ndarray] = {}
+        self._owned: dict[BlockIndex, np.ndarray] = {}
         sampler = SchedulerConfig.ddpm(planner.diffusion).with_sampler(SAMPLER)
         steps = num_inference_steps or SAMPLERS[SAMPLER].num_inference_steps
         planner.diffusion.select_timesteps(steps)  # Raises an error for an invalid number of steps.
@@ -143,24 +126,48 @@ class StreetPlan:
         back, right = (first + k * step for first, k in zip(self._first, index, strict=True))
         return Grid((back + size) * PIXEL_M, (right + size) * PIXEL_M, PIXEL_M, size, size)
 
+    def _cover(self, grid: Grid) -> Grid:
+        """Return the grid of all pixels of the plan that are needed to draw the streets on a grid."""
+        back, right = (int(low_m // PIXEL_M) - 1 for low_m in (grid.back_m, grid.right_m))
+        front, left = (int(-(-high_m // PIXEL_M)) + 1 for high_m in (grid.front_m, grid.left_m))
+        return Grid(front * PIXEL_M, left * PIXEL_M, PIXEL_M, front - back, left - right)
+
+    def _owns(self, index: BlockIndex) -> np.ndarray:
+        """Return the (size, size) bool mask of the pixels that a window owns."""
+        if index not in self._owned:
+            self._owned[index] = self.window_grid.owned_cells(index)
+        return self._owned[index]
+
     def list_windows(self, grid: Grid) -> list[BlockIndex]:
-        """List the windows that overlap a grid.
+        """List the windows from which the streets on a grid are drawn, without their predecessors.
 
         Args:
-            grid: Grid in the frame of block (0, 0).
+            grid: Grid in the frame of block (0, 0), of any resolution.
 
         Returns:
             Indices of the windows.
         """
-        ranges = []
-        for first, low_m, high_m in zip(
-            self._first, (grid.back_m, grid.right_m), (grid.front_m, grid.left_m), strict=True
+        cover, ranges = self._cover(grid), []
+        size, step = self.window_grid.size, self.window_grid.step
+        for first, low_m, count in zip(
+            self._first, (cover.back_m, cover.right_m), (cover.rows, cover.cols), strict=True
         ):
-            # Window k spans pixels first + k step to first + k step + size.
-            low, high = low_m / PIXEL_M - first, high_m / PIXEL_M - first
-            start = int((low - self.window_grid.size) // self.window_grid.step) + 1
-            ranges.append(range(start, int(-(-high // self.window_grid.step))))
-        return list(product(*ranges))
+            # Window k spans the pixels from first + k step to first + k step + size.
+            low = round(low_m / PIXEL_M) - first
+            ranges.append(range((low - size) // step + 1, -(-(low + count) // step)))
+        found = product(*ranges)
+        return [k for k in found if self._owns(k)[cover.intersect(self._find_window_grid(k))[1]].any()]
+
+    def list_predecessors(self, index: BlockIndex) -> list[BlockIndex]:
+        """List the windows that a window continues.
+
+        Args:
+            index: Index of the window (steps ahead, steps to the left).
+
+        Returns:
+            Indices of the windows.
+        """
+        return [other for other, _ in self.window_grid.known_cells(index)]
 
     def collect(self, grid: Grid) -> StreetDistances:
         """Return the plan of a rectangle, and generate missing windows.
@@ -171,16 +178,12 @@ class StreetPlan:
         Returns:
             Distances on all pixels of the plan that are needed to draw the streets on the grid.
         """
-        back, right = (int(low_m // PIXEL_M) - 1 for low_m in (grid.back_m, grid.right_m))
-        front, left = (int(-(-high_m // PIXEL_M)) + 1 for high_m in (grid.front_m, grid.left_m))
-        whole = Grid(front * PIXEL_M, left * PIXEL_M, PIXEL_M, front - back, left - right)
-        distance_m = np.full((CHANNELS, whole.rows, whole.cols), -REACH_M, np.float32)
-        for index in self.list_windows(whole):
-            owned = self.window_grid.owned_cells(index)
-            here, there = whole.intersect(self._find_window_grid(index))
-            if owned[there].any():
-                np.copyto(distance_m[:, *here], self.get_window(index)[:, *there], where=owned[there])
-        return StreetDistances(whole.front_m, whole.left_m, distance_m)
+        cover = self._cover(grid)
+        distance_m = np.full((CHANNELS, cover.rows, cover.cols), -REACH_M, np.float32)
+        for index in self.list_windows(grid):
+            here, there = cover.intersect(self._find_window_grid(index))
+            np.copyto(distance_m[:, *here], self.get_window(index)[:, *there], where=self._owns(index)[there])
+        return StreetDistances(cover.front_m, cover.left_m, distance_m)
 
     def draw(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
         """Draw the streets on a grid, and generate missing windows.
@@ -212,14 +215,23 @@ class StreetPlan:
         """
         waiting = [index]  # A loop, because distant windows have thousands of predecessors.
         while waiting:
-            needs = [other for other, _ in self.window_grid.known_cells(waiting[-1])]
-            if missing := [other for other in needs if other not in self._windows]:
+            missing = [other for other in self.list_predecessors(waiting[-1]) if other not in self.windows]
+            if missing and waiting[-1] not in self.windows:
                 waiting += missing
                 continue
             last = waiting.pop()
-            if last not in self._windows:
-                self._windows[last] = self._generate_window(last)
-        return self._windows[index]
+            if last not in self.windows:
+                self.windows[last] = self._generate_window(last)
+        return self.windows[index]
+
+    def put_window(self, index: BlockIndex, distance_m: np.ndarray) -> None:
+        """Store a window that another process has generated.
+
+        Args:
+            index: Index of the window.
+            distance_m: (2, size, size) distances (m).
+        """
+        self.windows[index] = distance_m
 
     def _find_known(self, index: BlockIndex) -> tuple[np.ndarray, np.ndarray]:
         """Return the known distances (2, size, size) of a window, and the mask (size, size) of the known pixels."""
@@ -229,7 +241,7 @@ class StreetPlan:
             known_m, is_known = self._given.copy(), self._is_given.copy()
         for other, cells in self.window_grid.known_cells(index):
             here, there = self.window_grid.overlap_cells(index, other), self.window_grid.overlap_cells(other, index)
-            np.copyto(known_m[:, *here], self._windows[other][:, *there], where=cells[here])
+            np.copyto(known_m[:, *here], self.windows[other][:, *there], where=cells[here])
             is_known |= cells
         if self.sketches:
             grid = self._find_window_grid(index)
@@ -247,10 +259,7 @@ class StreetPlan:
         if is_known.all():
             return known_m
         config, device = self.planner.config, self.planner.device
-        shift, scale = (
-            torch.tensor(value or [default] * CHANNELS, device=device)[:, None, None]
-            for value, default in ((config.shift, 0.0), (config.scale, 1.0))
-        )
+        shift, scale = (torch.tensor(value, device=device)[:, None, None] for value in (config.shift, config.scale))
         grid = self._find_window_grid(index)
         middle = (grid.front_m + grid.back_m) / 2, (grid.left_m + grid.right_m) / 2
         name = self.label_at(*middle) if self.label_at else f"{ANY}-{ANY}-free"
@@ -259,9 +268,8 @@ class StreetPlan:
         mask = torch.from_numpy(~is_known).to(known).expand(1, CHANNELS, -1, -1)
         condition = InpaintCondition(known[None], mask)
         self._scheduler.set_timesteps(self._steps, device=device)
-        denoise = self.planner.precompute_conditioning(self._scheduler.timesteps.tolist(), label.tolist())
         noise = SceneNoise(self.seed, [(self.scene_index, *index)], known.shape, device, PLAN)
-        model = with_known(denoise, condition, self.planner.diffusion)
+        model = with_known(self.planner.make_denoiser(), condition, self.planner.diffusion)
         latent: Tensor = sample_with_scheduler(model, self._scheduler, noise, label)
         latent = torch.where(mask.bool(), latent, condition.latent)[0]
         found_m = (latent * scale + shift).clamp(-REACH_M, REACH_M).cpu().numpy()

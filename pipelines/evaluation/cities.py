@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.distance import jensenshannon
 
-from models.composition.outpaint import RANKS, BlockGrid, BlockIndex
+from models.composition.block_grid import RANKS, BlockGrid, BlockIndex
 from models.labels import ANY, FREE
 from models.scene import DENSITIES, Grid, Scene
 from models.tensors import resample_scene_ground

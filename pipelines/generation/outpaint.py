@@ -2,34 +2,39 @@
 
 from __future__ import annotations
 
+import io
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import ray
 import torch
+from PIL import Image
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
+from models.composition.block_grid import RANKS, BlockGrid, BlockIndex, choose_arrangement, label_blocks, rank_outward
 from models.composition.outpaint import (
-    RANKS,
     BlockComposer,
-    BlockGrid,
-    BlockIndex,
     SceneBlock,
     Tile,
     check_roads,
     find_ground_height,
     generate_blocks,
-    label_blocks,
+    list_sketches,
+    make_label_finder,
+    uses_street_plan,
 )
 from models.composition.road_sketch import RoadMap, SketchedRoad
+from models.composition.street_plan import StreetPlan
 from models.execution import SamplingExecution
+from models.pipeline import PrITTIPipeline
 from models.sampling.repaint import InpaintingConfig
-from models.scene import UNSET, Scene
+from models.scene import UNSET, Grid, Scene
 from models.tensors import make_empty_scene
 from pipelines.generation.sample import (
     Request,
@@ -46,6 +51,7 @@ from pipelines.runtime.resources import make_model_resources, require_room
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, find_unwritten, require_written
 
+PLAN_PIXEL_M = 1.0  # Side of a pixel of the picture of a street plan.
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")
 MAX_RETRIES = 3  # Number of retries for a block whose process died.
 
@@ -61,7 +67,8 @@ class OutpaintRequest(Request):
         tile_m: Side (m) of the tiles in which a scene is written. No step holds a whole scene in memory. None: each
             scene is written as a whole.
         roads: Sketched roads in the frame of each scene, which its blocks contain.
-        margin: Width of the margin of blocks as a fraction of a block (`BlockGrid`).
+        margin: Width of the margin of blocks as a fraction of a block (`BlockGrid`). None: see `choose_arrangement`.
+        plan_streets: Whether streets are planned before blocks. None: see `uses_street_plan`.
         seed: Seed of the noise.
         overlap: Overlap of neighbouring blocks as a fraction of a block.
         mode: Outpainting mode of `generate_blocks`. None: the mode that the pipeline stores.
@@ -89,7 +96,8 @@ class OutpaintRequest(Request):
     free_blocks: str = "none"
     tile_m: float | None = None
     roads: tuple[SketchedRoad | RoadMap, ...] = ()
-    margin: float = 0.0
+    margin: float | None = None
+    plan_streets: bool | None = None
 
     def scene_id(self, number: int) -> str:
         """Return the id of an extended scene.
@@ -126,8 +134,39 @@ class OutpaintRequest(Request):
             ValueError: The overlap is not a whole number of cells.
         """
         return BlockGrid.from_overlap(
-            size, self.overlap, self.margin, rank=RANKS[self.order], num_blocks=self.num_blocks
+            size, self.overlap, self.margin or 0.0, rank=RANKS[self.order], num_blocks=self.num_blocks
         )
+
+
+@dataclass(frozen=True, order=True)
+class Window:
+    """A window of the street plan of a scene.
+
+    Attributes:
+        ahead: Number of steps ahead of the first window.
+        left: Number of steps to its left.
+    """
+
+    ahead: int
+    left: int
+
+
+Part = BlockIndex | Window  # What a task of a scene makes or needs.
+
+
+@dataclass(frozen=True)
+class WindowTask:
+    """A window of a street plan to generate.
+
+    Attributes:
+        number: Number of the scene in the run.
+        window: The window.
+        needs: Windows that this window continues.
+    """
+
+    number: int
+    window: Window
+    needs: frozenset[Part]
 
 
 @dataclass(frozen=True)
@@ -137,12 +176,12 @@ class BlockBatch:
     Attributes:
         number: Number of the scene in the run.
         indices: Indices of the blocks.
-        needs: Indices of the blocks that the batch depends on.
+        needs: Blocks that the batch depends on, and windows of the street plan.
     """
 
     number: int
     indices: tuple[BlockIndex, ...]
-    needs: frozenset[BlockIndex]
+    needs: frozenset[Part]
 
 
 @dataclass(frozen=True)
@@ -157,10 +196,15 @@ class TileTask:
 
     number: int
     tile: int
-    needs: frozenset[BlockIndex]
+    needs: frozenset[Part]
 
 
-def list_batches(block_grid: BlockGrid, number: int, batch_size: int) -> list[BlockBatch]:
+def list_batches(
+    block_grid: BlockGrid,
+    number: int,
+    batch_size: int,
+    windows: Mapping[BlockIndex, Sequence[Window]] | None = None,
+) -> list[BlockBatch]:
     """List the batches of a scene in an order that respects dependencies; the input block is not included.
 
     The batches depend only on the arguments. A resumed run therefore has the same batches.
@@ -169,6 +213,7 @@ def list_batches(block_grid: BlockGrid, number: int, batch_size: int) -> list[Bl
         block_grid: Block grid.
         number: Number of the scene in the run.
         batch_size: Maximum number of blocks per batch.
+        windows: Windows of the street plan that each block needs; None: there is no plan.
 
     Returns:
         Batches.
@@ -178,8 +223,30 @@ def list_batches(block_grid: BlockGrid, number: int, batch_size: int) -> list[Bl
         for start in range(0, len(group), batch_size):
             indices = tuple(group[start : start + batch_size])
             needs = frozenset(other for index in indices for other, _ in block_grid.known_cells(index)) - {(0, 0)}
-            listed.append(BlockBatch(number, indices, needs))
+            streets = frozenset(window for index in indices for window in (windows or {}).get(index, ()))
+            listed.append(BlockBatch(number, indices, needs | streets))
     return listed
+
+
+def list_windows(plan: StreetPlan, wanted: Iterable[Window], number: int) -> list[WindowTask]:
+    """List windows of a street plan and their predecessors, in an order that respects dependencies.
+
+    Args:
+        plan: Street plan.
+        wanted: Windows that are needed.
+        number: Number of the scene in the run.
+
+    Returns:
+        Windows.
+    """
+    needs: dict[BlockIndex, list[BlockIndex]] = {}
+    waiting = [(window.ahead, window.left) for window in wanted]
+    while waiting:
+        if (index := waiting.pop()) not in needs:
+            needs[index] = plan.list_predecessors(index)
+            waiting += needs[index]
+    ordered = sorted(needs, key=lambda index: (rank_outward(index), index))
+    return [WindowTask(number, Window(*index), frozenset(Window(*one) for one in needs[index])) for index in ordered]
 
 
 # ------------------------------------------------------------------------------------------------------------ blocks
@@ -196,6 +263,37 @@ def make_block_path(directory: str, index: BlockIndex) -> str:
         Path of a .safetensors file.
     """
     return storage.join_uri(directory, f"{index[0]:+05d}{index[1]:+05d}.safetensors")
+
+
+def make_window_path(directory: str, window: Window) -> str:
+    """Return the path of the file of a window of a street plan.
+
+    Args:
+        directory: Directory of the blocks of the scene.
+        window: The window.
+
+    Returns:
+        Path of a .safetensors file.
+    """
+    return storage.join_uri(directory, f"streets{window.ahead:+05d}{window.left:+05d}.safetensors")
+
+
+def read_window(path: str) -> np.ndarray:
+    """Read the distances of a window of a street plan.
+
+    Args:
+        path: Path of the .safetensors file.
+
+    Returns:
+        (2, size, size) distances (m).
+
+    Raises:
+        ValueError: The file is damaged. The message names the file.
+    """
+    try:
+        return load(storage.read_bytes(path))["distance_m"].numpy()
+    except (SafetensorError, KeyError) as error:
+        raise ValueError(f"{path}: no complete street plan ({error}); delete the file and run the job again") from error
 
 
 def write_block(block: SceneBlock, path: str) -> None:
@@ -249,11 +347,44 @@ class Outpainter:
         self.pipeline = load_pipeline(request.model)
         self.pipeline.use_constraints(request.constraints)
         self.pipeline.set_execution(request.execution)
+        self.plans: dict[int, StreetPlan] = {}  # Street plan of the last scene.
 
     @cached_property
     def block_grid(self) -> BlockGrid:
         """Return the block grid for the latent size of the model."""
         return self.request.make_block_grid(self.pipeline.latent_shape[-1])
+
+    def load_plan(self, number: int, windows: Iterable[Window]) -> StreetPlan:
+        """Return the street plan of a scene.
+
+        Args:
+            number: Number of the scene in the run.
+            windows: Windows that have been generated and are needed.
+
+        Returns:
+            The plan with these windows.
+        """
+        if number not in self.plans:
+            self.plans = {number: make_plan(self.pipeline, self.request, self.load_scene(number), number)}
+        plan = self.plans[number]
+        for window in windows:
+            index = (window.ahead, window.left)
+            if index not in plan.windows:
+                path = make_window_path(self.request.blocks_directory(number), window)
+                plan.put_window(index, read_window(path))
+        return plan
+
+    def generate_window(self, task: WindowTask) -> None:
+        """Generate a window of a street plan and write it to a file.
+
+        Args:
+            task: Window to generate.
+        """
+        plan = self.load_plan(task.number, (one for one in task.needs if isinstance(one, Window)))
+        distance_m = plan.get_window((task.window.ahead, task.window.left))
+        data = save({"distance_m": torch.from_numpy(distance_m.copy())})
+        path = make_window_path(self.request.blocks_directory(task.number), task.window)
+        storage.write_whole(path, lambda stream: stream.write(data))
 
     def load_scene(self, number: int) -> Scene:
         """Return an input scene, resampled to the grid of the model.
@@ -300,7 +431,11 @@ class Outpainter:
             batch: Blocks to generate.
         """
         request = self.request
-        composer, given, known = self.load_blocks(batch.number, sorted(batch.needs))
+        parts = sorted(part for part in batch.needs if isinstance(part, tuple))
+        composer, given, known = self.load_blocks(batch.number, parts)
+        if request.plan_streets:
+            windows = (part for part in batch.needs if isinstance(part, Window))
+            composer.roads = [*request.roads, self.load_plan(batch.number, windows)]
         kind = self.pipeline.dit.config.label
         label = request.labels_map or request.label or find_scene_label(given, kind)
         blocks = generate_blocks(
@@ -326,7 +461,8 @@ class Outpainter:
             task: Tile to write. Without tiles, it covers the scene.
         """
         request = self.request
-        composer, given, blocks = self.load_blocks(task.number, sorted(task.needs))
+        parts = sorted(part for part in task.needs if isinstance(part, tuple))
+        composer, given, blocks = self.load_blocks(task.number, parts)
         tiles = composer.cut_tiles(request.tile_m)
         tile, name = tiles[task.tile], request.scene_id(task.number)
         scene = composer.stitch(blocks, given, tile.grid)
@@ -346,7 +482,8 @@ class Outpainter:
         request.shard(task.number * len(tiles) + task.tile).write([scene])
 
     def finish(self, number: int) -> None:
-        """Write the table of blocks of a scene, and its tileset if it has tiles; delete the block files.
+        """Write the table of blocks of a scene, the picture of its street plan if it has one, and its tileset if it has
+        tiles; delete the block files.
 
         Args:
             number: Number of the scene in the run.
@@ -367,6 +504,11 @@ class Outpainter:
                 tiles.append(TileContent(part, low_m, high_m, tile.origin_m))
             storage.write_json(make_tileset(tiles), storage.join_uri(place, "tileset.json"))
             storage.write_text(render_city_html(name, grids), make_page_path(request, number, "index.html"))
+        if request.plan_streets:
+            plan = self.load_plan(number, ())
+            grid = widen_grid(composer.find_grid(self.block_grid.indices()), given.grid)
+            picture = draw_plan(self.load_plan(number, (Window(*k) for k in plan.list_windows(grid))), grid)
+            storage.write_whole(make_plan_path(request, number), lambda stream: stream.write(picture))
         storage.write_parquet(pa.Table.from_pylist(rows), make_blocks_table_path(request, number))
         storage.delete_directory(request.blocks_directory(number))
 
@@ -410,6 +552,71 @@ def make_blocks_table_path(request: OutpaintRequest, number: int) -> str:
     return storage.join_uri(request.output, "block_tables", request.run, f"{number:07d}.parquet")
 
 
+def make_plan(pipeline: PrITTIPipeline, request: OutpaintRequest, given: Scene, number: int) -> StreetPlan:
+    """Return the street plan of a scene, without generated windows.
+
+    Args:
+        pipeline: Pipeline with a street planner.
+        request: Options of outpainting.
+        given: Scene on the grid of the model.
+        number: Number of the scene in the run.
+
+    Returns:
+        The plan.
+    """
+    kind, block_grid = pipeline.dit.config.label, request.make_block_grid(pipeline.latent_shape[-1])
+    label = request.labels_map or request.label or find_scene_label(given, kind)
+    labels = label_blocks(kind, label, request.num_blocks, request.free_blocks)
+    step_m = BlockComposer(block_grid, pipeline.spec, pipeline.encode).step_m
+    label_at = make_label_finder(labels, step_m, given.grid)
+    return pipeline.plan_streets(given, label_at, request.seed, number, list_sketches(request.roads))
+
+
+def widen_grid(whole: Grid, first: Grid) -> Grid:
+    """Return the grid of the picture of a street plan, whose middle is that of the given scene.
+
+    Args:
+        whole: Grid of the city.
+        first: Grid of the given scene.
+
+    Returns:
+        Smallest grid that covers the city, with pixels of PLAN_PIXEL_M.
+    """
+    ahead_m, left_m = (first.front_m + first.back_m) / 2, (first.left_m + first.right_m) / 2
+    reach = max(whole.front_m - ahead_m, ahead_m - whole.back_m), max(whole.left_m - left_m, left_m - whole.right_m)
+    rows, cols = (2 * round(one / PLAN_PIXEL_M) for one in reach)
+    return Grid(ahead_m + rows / 2 * PLAN_PIXEL_M, left_m + cols / 2 * PLAN_PIXEL_M, PLAN_PIXEL_M, rows, cols)
+
+
+def draw_plan(plan: StreetPlan, grid: Grid) -> bytes:
+    """Draw a street plan as a map that `--road-sketch` accepts: white roads, grey sidewalks, black elsewhere.
+
+    Args:
+        plan: Street plan.
+        grid: Grid of the picture.
+
+    Returns:
+        PNG file.
+    """
+    road, paved = plan.draw(grid)
+    stream = io.BytesIO()
+    Image.fromarray(np.where(road, 255, np.where(paved, 128, 0)).astype(np.uint8)).save(stream, "png")
+    return stream.getvalue()
+
+
+def make_plan_path(request: OutpaintRequest, number: int) -> str:
+    """Return the path of the picture of the street plan of a scene.
+
+    Args:
+        request: Options of outpainting.
+        number: Number of the scene in the run.
+
+    Returns:
+        Path of a PNG file.
+    """
+    return storage.join_uri(request.output, "street_plans", request.run, f"{request.scene_id(number)}.png")
+
+
 # --------------------------------------------------------------------------------------------------------------- run
 
 
@@ -431,13 +638,20 @@ def outpaint_scenes(
         Path of the table of blocks of each scene (`make_blocks_table_path`), in order.
 
     Raises:
-        ValueError: The output contains a run of the same name with other options, or the side of the tiles is invalid.
+        ValueError: The output contains a run of the same name with other options, the side of the tiles is invalid, or
+            the model cannot plan streets or follow roads.
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
+    mode, is_far = str(request.mode or pipeline.config.neighbour_latents), max(request.num_blocks) > 1
+    plans_streets = uses_street_plan(pipeline, request.roads, mode, is_far, request.plan_streets)
+    has_plan = plans_streets or any(isinstance(one, RoadMap) for one in request.roads)
+    chosen_options = request.order, request.overlap, request.free_blocks, request.margin
     request = replace(
         request,
-        mode=request.mode or pipeline.config.neighbour_latents,
+        mode=mode,
+        plan_streets=plans_streets,
+        margin=choose_arrangement(request.num_blocks, *chosen_options, has_plan).margin,
         repaint=pipeline.resolve_inpainting(request.repaint),
         constraints=pipeline.resolve_constraints(request.constraints),
     )
@@ -447,12 +661,14 @@ def outpaint_scenes(
 
     for shard, row in chosen if request.roads else []:
         scene = resample_to_model_grid(shard.scenes([row])[0], pipeline.spec)
-        check_roads(request.roads, scene, str(request.mode), pipeline.has_split_latent)
-    tiles = BlockComposer(block_grid, pipeline.spec, pipeline.encode).cut_tiles(request.tile_m)
+        check_roads(request.roads, scene, mode, pipeline.has_split_latent)
+    composer = BlockComposer(block_grid, pipeline.spec, pipeline.encode)
+    tiles = composer.cut_tiles(request.tile_m)
     promised = {request.shard(number): 1 for number in range(len(chosen) * len(tiles))}
     files = set(storage.list_files(parts[0], ".safetensors"))
     unwritten = {shard.number for shard in find_unwritten(promised)}
     waiting, missing, done = [], [], {}
+    windows: list[WindowTask] = []
     for number in range(len(chosen)):
         left = [k for k in range(len(tiles)) if number * len(tiles) + k in unwritten]
         if not left and storage.exists(make_blocks_table_path(request, number)):
@@ -460,15 +676,27 @@ def outpaint_scenes(
         missing += [TileTask(number, k, frozenset(tiles[k].blocks) - {(0, 0)}) for k in left]
         directory = request.blocks_directory(number)
         there = {index for index in block_grid.indices() if make_block_path(directory, index) in files}
-        done[number] = there
-        waiting += [b for b in list_batches(block_grid, number, request.batch_size) if not there.issuperset(b.indices)]
+        done[number] = set(there)
+        streets: dict[BlockIndex, list[Window]] = {}
+        if request.plan_streets:
+            shard, row = chosen[number]
+            given = resample_to_model_grid(shard.scenes([row])[0], pipeline.spec)
+            plan = make_plan(pipeline, request, given, number)
+            grids = {index: composer.find_grid([index]) for index in block_grid.indices() if index != (0, 0)}
+            streets = {index: [Window(*k) for k in plan.list_windows(grid)] for index, grid in grids.items()}
+            needed = list_windows(plan, set().union(*streets.values()), number)
+            written = {task.window for task in needed if make_window_path(directory, task.window) in files}
+            done[number] |= written
+            windows += [task for task in needed if task.window not in written]
+        batches = list_batches(block_grid, number, request.batch_size, streets)
+        waiting += [batch for batch in batches if not there.issuperset(batch.indices)]
     if on_blocks:
         per_scene = len(block_grid.indices()) - 1
         on_blocks(per_scene * len(chosen) - sum(len(batch.indices) for batch in waiting))
     if request.tile_m is not None:  # Complete row after row of tiles.
         waiting.sort(key=lambda batch: (batch.number, batch.indices[0][0] // 2, block_grid.rank(batch.indices[0])))
     if done:
-        run_batches(request, chosen, waiting, missing, done, num_actors, on_blocks)
+        run_batches(request, chosen, waiting, windows, missing, done, num_actors, on_blocks)
     require_written(promised)
     return [make_blocks_table_path(request, number) for number in range(len(chosen))]
 
@@ -477,8 +705,9 @@ def run_batches(
     request: OutpaintRequest,
     chosen: list[tuple[Shard, int]],
     waiting: list[BlockBatch],
+    windows: list[WindowTask],
     tiles: list[TileTask],
-    done: dict[int, set[BlockIndex]],
+    done: dict[int, set[Part]],
     num_actors: int,
     on_blocks: Callable[[int], None] | None,
 ) -> None:
@@ -488,8 +717,9 @@ def run_batches(
         request: Options of outpainting.
         chosen: Shard and row of each selected scene.
         waiting: Batches to generate.
+        windows: Windows of street plans to generate.
         tiles: Tiles to write.
-        done: Finished blocks by scene number.
+        done: Finished blocks and windows by scene number.
         num_actors: Maximum number of actors.
         on_blocks: Called with the number of blocks of each finished batch.
     """
@@ -501,7 +731,7 @@ def run_batches(
     count = min(num_actors, max(len(waiting), len(done)), require_room(need, 1, "an actor (Outpainter)"))
     workers: list[Any] = [actor.remote(request, chosen) for _ in range(count)]
     try:
-        schedule_batches(workers, waiting, tiles, done, on_blocks)
+        schedule_batches(workers, waiting, windows, tiles, done, on_blocks)
     finally:  # The traceback of an error references the actors. Without ray.kill, the actors would keep their CPUs.
         for worker in workers:
             ray.kill(worker)
@@ -510,8 +740,9 @@ def run_batches(
 def schedule_batches(
     workers: list,
     waiting: list[BlockBatch],
+    windows: list[WindowTask],
     tiles: list[TileTask],
-    done: dict[int, set[BlockIndex]],
+    done: dict[int, set[Part]],
     on_blocks: Callable[[int], None] | None,
 ) -> None:
     """Give each idle actor a batch, a tile to write or a scene to finish, until all work is done.
@@ -522,18 +753,24 @@ def schedule_batches(
     Args:
         workers: Actor handles.
         waiting: Batches to generate; the function empties the list.
+        windows: Windows of street plans to generate; the function empties the list.
         tiles: Tiles to write; the function empties the list.
-        done: Finished blocks by scene number; the function adds the new blocks.
+        done: Finished blocks and windows by scene number; the function adds the new ones.
         on_blocks: Called with the number of blocks of each finished batch.
     """
     idle: list = []
     running: dict[ray.ObjectRef, tuple] = {worker.__ray_ready__.remote(): (None, worker) for worker in workers}
-    left = dict.fromkeys(done, 0) | Counter(task.number for task in (*waiting, *tiles))
+    left = dict.fromkeys(done, 0) | Counter(task.number for task in (*waiting, *windows, *tiles))
     whole = [number for number, tasks_left in left.items() if not tasks_left]
-    while waiting or tiles or whole or any(task is not None for task, _ in running.values()):
-        while idle and (task := pop_ready_task(waiting, tiles, whole, done)) is not None:
+    while waiting or windows or tiles or whole or any(task is not None for task, _ in running.values()):
+        while idle and (task := pop_ready_task(waiting, windows, tiles, whole, done)) is not None:
             worker = idle.pop()
-            calls = {BlockBatch: worker.generate, TileTask: worker.write_tile, int: worker.finish}
+            calls = {
+                BlockBatch: worker.generate,
+                WindowTask: worker.generate_window,
+                TileTask: worker.write_tile,
+                int: worker.finish,
+            }
             call = calls[type(task)]
             running[call.remote(task)] = task, worker
         (finished,), _ = ray.wait(list(running), num_returns=1)
@@ -544,29 +781,36 @@ def schedule_batches(
             done[task.number].update(task.indices)
             if on_blocks:
                 on_blocks(len(task.indices))
-        if isinstance(task, (BlockBatch, TileTask)):
+        if isinstance(task, WindowTask):
+            done[task.number].add(task.window)
+        if isinstance(task, (BlockBatch, WindowTask, TileTask)):
             left[task.number] -= 1
             if not left[task.number]:
                 whole.append(task.number)
 
 
 def pop_ready_task(
-    waiting: list[BlockBatch], tiles: list[TileTask], whole: list[int], done: Mapping[int, set[BlockIndex]]
-) -> BlockBatch | TileTask | int | None:
+    waiting: list[BlockBatch],
+    windows: list[WindowTask],
+    tiles: list[TileTask],
+    whole: list[int],
+    done: Mapping[int, set[Part]],
+) -> BlockBatch | WindowTask | TileTask | int | None:
     """Remove and return the first task whose dependencies are done.
 
     Args:
-        waiting: Batches to generate.
+        waiting: Batches to generate. Batches whose windows are done are generated before further windows.
+        windows: Windows of street plans to generate.
         tiles: Tiles to write. Tiles whose blocks are done are written before further blocks are generated.
         whole: Numbers of the scenes in which all tiles are written.
-        done: Finished blocks by scene number.
+        done: Finished blocks and windows by scene number.
 
     Returns:
-        A batch, a tile, or the number of a scene to finish. None: no task is ready.
+        A batch, a window, a tile, or the number of a scene to finish. None: no task is ready.
     """
     if whole:
         return whole.pop(0)
-    for tasks in (tiles, waiting):
+    for tasks in (tiles, waiting, windows):
         for position, task in enumerate(tasks):
             if task.needs <= done[task.number]:
                 return tasks.pop(position)

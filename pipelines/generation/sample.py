@@ -152,6 +152,9 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
     execution = {"precision": "fp32", "compile": False, "decode_batch_size": 1}
     defaults = {"constraints": False, "pag_scale": 0.0, "repair": False, "execution": execution}
     defaults |= {"labels_map": None, "free_blocks": "none", "tile_m": None, "roads": (), "margin": 0.0}
+    defaults |= {"plan_streets": False}
+    if options.get("plan_streets") and pipeline.street_planner is not None:
+        options["street_planner"] = digest_weights(pipeline.street_planner)
     options = {name: value for name, value in options.items() if name not in defaults or value != defaults[name]}
     # RePaint uses the noise scaling only if eta is not 1.
     if options.get("repaint", {}).get("known_guidance_scale") == 1:

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
-from models.composition.street_distances import CHANNELS, PIXEL_M, measure_street_distances, read_street_masks
+from models.composition.street_distances import PIXEL_M, measure_street_distances, read_street_masks
 from models.scene import VEGETATION, VEHICLES, Grid, Scene
+from models.street_planner import CHANNELS
 from pipelines.preprocess.sources.town.generator import TEST_SEEDS_START
 from pipelines.preprocess.sources.town.version2.town import make_large_crops
 from pipelines.runtime import storage

@@ -7,8 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from models.composition.street_plan import LABEL_KIND
 from models.labels import compose_label, find_label_index
+from models.street_planner import LABEL_KIND
 from pipelines.preprocess.street_maps import label_street_maps
 from pipelines.schema.density_labels import DensityThresholds
 from pipelines.schema.tables import Shard

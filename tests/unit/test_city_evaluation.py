@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import random_scene
 
-from models.composition.outpaint import RANKS, BlockGrid, label_blocks
+from models.composition.block_grid import RANKS, BlockGrid, label_blocks
 from models.scene import VEGETATION, VEHICLES
 from pipelines.evaluation.cities import (
     CityResult,

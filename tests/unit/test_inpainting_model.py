@@ -8,9 +8,9 @@ import torch
 from helpers import QUICK, random_scene, small_spec, tiny_pipeline
 from torch import Tensor
 
+from models.composition.block_grid import choose_arrangement, label_blocks
 from models.composition.infinite import InfiniteScene
 from models.composition.inpaint import make_latent_mask
-from models.composition.outpaint import choose_arrangement, label_blocks
 from models.dit import DiT
 from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS

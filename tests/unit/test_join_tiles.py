@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from helpers import random_scene
 
-from models.composition.outpaint import BlockComposer, BlockGrid
+from models.composition.block_grid import BlockGrid
+from models.composition.outpaint import BlockComposer
 from models.layout import LayoutSpec
 from models.scene import Grid
 from pipelines.evaluation.cities import read_run_record

@@ -10,16 +10,9 @@ from helpers import QUICK, random_scene, scenes_equal, small_spec
 
 from jobs.implementation.outpaint_scenes import arrange_blocks
 from jobs.outpaint_scenes import Config
+from models.composition.block_grid import BlockGrid, label_blocks, rank_four_colors, rank_outward
 from models.composition.infinite import InfiniteScene
-from models.composition.outpaint import (
-    BlockComposer,
-    BlockGrid,
-    SceneBlock,
-    find_ground_height,
-    label_blocks,
-    rank_four_colors,
-    rank_outward,
-)
+from models.composition.outpaint import BlockComposer, SceneBlock, find_ground_height
 from models.composition.seam_blending import extract_new_part
 from models.layout import LayoutSpec
 from models.scene import KITTI_GROUND_CLASSES, Grid, make_yaw_rotation

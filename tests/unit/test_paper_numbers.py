@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers import ROOT
 
-from models.composition.outpaint import choose_arrangement
+from models.composition.block_grid import choose_arrangement
 from models.dit import DiT
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE

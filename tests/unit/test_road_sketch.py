@@ -11,7 +11,8 @@ from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
 from jobs.implementation.outpaint_scenes import read_road_sketch
-from models.composition.outpaint import BlockComposer, BlockGrid, SceneBlock, check_roads
+from models.composition.block_grid import BlockGrid
+from models.composition.outpaint import BlockComposer, SceneBlock, check_roads
 from models.composition.road_sketch import RoadMap, SketchedRoad, add_sketched_ground, check_sketch, draw_roads
 from models.layout import LayoutSpec
 from models.pipeline import PrITTIPipeline
