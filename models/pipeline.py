@@ -1029,8 +1029,9 @@ class PrITTIPipeline:
         self.require_grid(scene)
         mode = str(mode or self.config.neighbour_latents)
         has_plan = uses_street_plan(self, roads, mode, max(num_blocks) > 1, plan_streets)
-        has_map = any(isinstance(one, RoadMap) for one in roads)
-        arrangement = choose_arrangement(num_blocks, order, overlap, free_blocks, margin, has_plan or has_map)
+        is_planned = has_plan or any(isinstance(one, RoadMap) for one in roads)
+        cells = self.latent_shape[-1] * is_planned
+        arrangement = choose_arrangement(num_blocks, order, overlap, free_blocks, margin, cells)
         if isinstance(label, str):
             label = label_blocks(self.dit.config.label, label, num_blocks, arrangement.free_blocks)
         return outpaint_scene(

@@ -28,6 +28,7 @@ from models.scene import (
     canonicalize_boxes,
     make_yaw_rotation,
 )
+from models.street_planner import StreetPlanner
 from pipelines.schema.palette import CLASS_ID, EMPTY
 
 ROOT = Path(__file__).parents[1]  # folder of the repository
@@ -91,6 +92,13 @@ def tiny_pipeline(spec: LayoutSpec) -> PrITTIPipeline:
     made = PrITTIPipeline(lvae, dit)
     made.set_progress_bar_config(disable=True)
     return made
+
+
+def tiny_planner(size: int = 32) -> StreetPlanner:
+    """Return a street planner with random weights, for windows of 4 m per pixel."""
+    torch.manual_seed(0)
+    made = StreetPlanner(size=size, block_px=4, widths=(32,), shift=(-5.0, -4.0), scale=(4.0, 4.0))
+    return made.eval().requires_grad_(False)
 
 
 def scenes_equal(a, b) -> bool:

@@ -94,7 +94,7 @@ def choose_arrangement(
     overlap: float | None = None,
     free_blocks: str | None = None,
     margin: float | None = None,
-    has_plan: bool = False,
+    planned_cells: int = 0,
 ) -> Arrangement:
     """Return how blocks are arranged.
 
@@ -107,9 +107,10 @@ def choose_arrangement(
         order: Order of the blocks, a key of RANKS; None: the default.
         overlap: Overlap of neighbouring blocks; None: 0.25 for colours and 0.5 for outward.
         free_blocks: Blocks that count as crops at any place and heading, a key of FREE_BLOCKS; None: the default.
-        margin: Width of the margin of blocks as a fraction of a block; None: PLAN_MARGIN with a plan, else 0.
-        has_plan: Whether all streets are known. Blocks see only one side of streets along their border, so a margin
-            leaves these to the neighbours.
+        margin: Width of the margin of blocks as a fraction of a block; None: PLAN_MARGIN if all streets are
+            known, else 0.
+        planned_cells: Number of latent cells per side of a block if all streets are known, else 0. Blocks see only one
+            side of streets along their border, so a margin of whole cells leaves these to the neighbours.
 
     Returns:
         The arrangement.
@@ -123,7 +124,7 @@ def choose_arrangement(
     if overlap is None:
         overlap = 0.25 if order == "colours" else 0.5
     if margin is None:
-        margin = PLAN_MARGIN if has_plan and overlap > 2 * PLAN_MARGIN else 0.0
+        margin = int(planned_cells * PLAN_MARGIN) / max(planned_cells, 1) if overlap > 2 * PLAN_MARGIN else 0.0
     return Arrangement(order, overlap, free_blocks or ("all" if is_far else "none"), margin)
 
 

@@ -74,10 +74,9 @@ class InfiniteScene:
         self.options: dict[str, Any] = {"mode": mode, "repaint": repaint, "guidance_scale": guidance_scale}
         self.plans_streets = uses_street_plan(model, roads, mode, True, plan_streets)
         has_plan = self.plans_streets or any(isinstance(one, RoadMap) for one in roads)
-        margin = choose_arrangement((2, 2, 2, 2), order, overlap, None, margin, has_plan).margin
-        block_grid = BlockGrid.from_overlap(
-            model.latent_shape[-1], overlap, margin, rank=find_rank(order), num_blocks=None
-        )
+        size = model.latent_shape[-1]
+        margin = choose_arrangement((2, 2, 2, 2), order, overlap, None, margin, size * has_plan).margin
+        block_grid = BlockGrid.from_overlap(size, overlap, margin, rank=find_rank(order), num_blocks=None)
         self.composer = BlockComposer(block_grid, model.spec, model.encode, roads=roads)
         self.blocks: dict[BlockIndex, SceneBlock] = {}
         self.scene, self.roads = scene, roads

@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
@@ -21,6 +21,7 @@ CORE_M = 1.5  # Pixels of a map that lie deeper inside of a road are compared wi
 MAX_CONTRADICTION = 0.05  # Largest share of these pixels that may lie on other ground of the given scene.
 
 
+@runtime_checkable
 class Streets(Protocol):
     """Streets that outpainting takes as known ground: a sketched road, a map or a plan."""
 

@@ -645,13 +645,13 @@ def outpaint_scenes(
     pipeline = load_pipeline(request.model)
     mode, is_far = str(request.mode or pipeline.config.neighbour_latents), max(request.num_blocks) > 1
     plans_streets = uses_street_plan(pipeline, request.roads, mode, is_far, request.plan_streets)
-    has_plan = plans_streets or any(isinstance(one, RoadMap) for one in request.roads)
+    is_planned = plans_streets or any(isinstance(one, RoadMap) for one in request.roads)
     chosen_options = request.order, request.overlap, request.free_blocks, request.margin
     request = replace(
         request,
         mode=mode,
         plan_streets=plans_streets,
-        margin=choose_arrangement(request.num_blocks, *chosen_options, has_plan).margin,
+        margin=choose_arrangement(request.num_blocks, *chosen_options, pipeline.latent_shape[-1] * is_planned).margin,
         repaint=pipeline.resolve_inpainting(request.repaint),
         constraints=pipeline.resolve_constraints(request.constraints),
     )
