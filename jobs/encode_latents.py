@@ -30,6 +30,9 @@ class Config:
     """Number of models that run in parallel; use one per GPU."""
     gpus: GpusOption = None
     wait_for_resources_s: WaitForResourcesOption = 0.0
+    streets: bool = False
+    """Encode the streets of each scene without other content, too: the table street_latents, which train_dit.py
+    --known-streets-share needs."""
     batch_size: int = 16
     """Scenes per batch."""
 

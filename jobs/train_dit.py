@@ -69,6 +69,9 @@ class Config:
     crop_repeats: int = 1
     """Number of times that each crop at any place is used per epoch; each view of a vehicle is used once. Far blocks of
     large scenes are such crops."""
+    known_streets_share: float | None = None
+    """Share of training samples that know the ground of all streets, as blocks that follow a street plan. It needs
+    latents of encode_latents.py --streets (default: as in the preset; paper: 0)."""
     normalise_latents: bool | None = None
     """Normalise each latent channel to mean 0 and standard deviation 1 (default: as in the preset; paper: False)."""
     sample_posterior: bool | None = None

@@ -146,6 +146,8 @@ class DiTPreset:
             this.
         sample_posterior: Whether training latents are drawn from the posteriors of the layout VAE, as in the paper. If
             False, they are the means.
+        known_streets_share: Share of training samples that know the ground of all streets, as blocks that follow a
+            street plan. The latents must be encoded with streets.
     """
 
     lvae: str
@@ -161,6 +163,7 @@ class DiTPreset:
     neighbour_latents: str = "reencode"
     attach: bool = True
     sample_posterior: bool = True
+    known_streets_share: float = 0.0
 
     def architecture(self) -> dict:
         """Return all keyword arguments of `DiT` except those that depend on the latents."""

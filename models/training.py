@@ -369,11 +369,15 @@ class DiffusionLossConfig:
         loss_weighting: Weighting of the timesteps (`compute_loss_weight`).
         sample_posterior: Whether each step draws latents from the posteriors of the layout VAE. If False, the latents
             are the means of the posteriors.
+        known_streets_share: Share of samples that also know the ground of all streets, as blocks that follow a street
+            plan. The batches then need the arrays `street_ground` (b, channels / 2, h, w), the latents of scenes
+            without other content than streets, and `street_cells` (b, h, w).
     """
 
     timestep_sampling: TimestepSampling = "uniform"
     loss_weighting: LossWeighting = "uniform"
     sample_posterior: bool = True
+    known_streets_share: float = 0.0
 
 
 def make_diffusion_loss(
@@ -407,6 +411,7 @@ def make_diffusion_loss(
         side = round(SCENE_M / PIXEL_M)
         inside = slice((shape[1] - side) // 2, (shape[1] + side) // 2)
         border_m[inside, inside] = torch.from_numpy(measure_border_distances(side, side)).float()
+    share = config.known_streets_share if inpainting and not is_planner else 0.0
     num_mask = 0 if not inpainting else NUM_STREET_UNIFORM if is_planner else NUM_UNIFORM
 
     def loss(
@@ -417,9 +422,22 @@ def make_diffusion_loss(
         # No line below waits for a GPU. Random numbers are thus drawn during the backward pass of the previous step.
         *posterior_noise, noise = sample_noise(generators, shape, device, count=1 + config.sample_posterior)
         count = 2 if remaining is None else 4
-        uniform = sample_uniform(generators, count + num_mask, device)
+        uniform = sample_uniform(generators, count + num_mask + (share > 0), device)
         drawn = mean + (0.5 * arrays["logvar"].float()).exp() * posterior_noise[0] if posterior_noise else mean
         latent = (drawn - shift) / scale
+        if inpainting:
+            mask = (
+                make_street_masks(uniform[:, count:], mean, border_m)
+                if is_planner
+                else make_training_masks(uniform[:, count : count + num_mask], shape[0], shape[1])
+            )
+        if share:
+            half = shape[0] // 2
+            streets = (arrays["street_ground"].float() - shift[:half]) / scale[:half]
+            is_street = (arrays["street_cells"] > 0) & (uniform[:, -1] < share)[:, None, None]
+            follows = is_street[:, None] & (mask[:, :half] > 0)
+            latent = torch.cat([torch.where(follows, streets, latent[:, :half]), latent[:, half:]], dim=1)
+            mask = torch.cat([mask[:, :half] * ~follows, mask[:, half:]], dim=1)
         timestep = sample_timesteps(uniform[:, 0], config.timestep_sampling, diffusion.num_timesteps)
         if remaining is not None:
             dropped = (uniform[:, 2:4] < PART_DROPOUT).long()
@@ -427,11 +445,6 @@ def make_diffusion_loss(
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
         noisy = diffusion.add_noise(latent, noise, timestep)
         if inpainting:
-            mask = (
-                make_street_masks(uniform[:, count:], mean, border_m)
-                if is_planner
-                else make_training_masks(uniform[:, count:], shape[0], shape[1])
-            )
             noisy = join_known(noisy, InpaintCondition(latent, mask))
         error = F.mse_loss(model(noisy, timestep, label).float(), noise, reduction="none")
         error = (error * mask if inpainting else error).flatten(1).mean(1)

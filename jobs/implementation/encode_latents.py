@@ -24,6 +24,7 @@ def encode(config: Config) -> dict:
             config.num_actors,
             config.batch_size,
             lambda row: bar.advance(shown, int(row["count"])),
+            config.streets,
         )
 
 

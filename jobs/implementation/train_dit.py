@@ -71,6 +71,11 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     latents_root = make_absolute(config.latents) if config.latents else root
     require_latents(latents_root, root)
     latents = storage.read_json(storage.join_uri(latents_root, "latents.json"))
+    if row.known_streets_share and not latents.get("streets"):
+        raise ValueError(
+            f"--known-streets-share {row.known_streets_share}: {latents_root} has no latents of streets; run"
+            f" jobs/encode_latents.py --streets --dataset {root} --output {latents_root}"
+        )
     architecture = make_dit_architecture(row, latents, load_encoder(latents, latents_root), label_kind)
     start = load_start(config.start_from, latents["lvae_digest"], architecture) if config.start_from else None
     architecture |= start.inherited if start else {}
@@ -90,13 +95,15 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
         storage_path=home_path("runs"),
         build=partial(build, architecture, settings, execution, row.label_dropout, start, loss_config),
         stream=stream,
-        reader=LatentReader(latents_root, label_kind),
+        reader=LatentReader(latents_root, label_kind, row.known_streets_share > 0),
         settings=settings,
         identity=identity,
         tracker=tracker,
         checkpoint_every=config.checkpoint_every or max(4, settings.steps // 20),
         log_every=max(1, min(50, settings.steps // 50)),
-        validate=SamplingCheck(root, dataset.source, latents_root, latents["lvae"], label_kind),
+        validate=SamplingCheck(
+            root, dataset.source, latents_root, latents["lvae"], label_kind, streets=row.known_streets_share > 0
+        ),
     )
     sampling = (start.sampling if start else {}) | {"neighbour_latents": row.neighbour_latents, "attach": row.attach}
     return training, partial(complete_pipeline, latents["lvae"], sampling)
@@ -148,6 +155,7 @@ def make_loss_config(config: Config, row: DiTPreset) -> DiffusionLossConfig:
         timestep_sampling="logit_normal" if config.timestep_sampling == "logit-normal" else "uniform",
         loss_weighting="min_snr" if config.loss_weighting == "min-snr" else "uniform",
         sample_posterior=row.sample_posterior,
+        known_streets_share=row.known_streets_share,
     )
 
 
@@ -172,6 +180,12 @@ def resolve_preset(config: Config) -> DiTPreset:
         row = replace(row, normalise_latents=config.normalise_latents)
     if config.sample_posterior is not None:
         row = replace(row, sample_posterior=config.sample_posterior)
+    if config.known_streets_share is not None:
+        row = replace(row, known_streets_share=config.known_streets_share)
+    if not 0 <= row.known_streets_share <= 1 or (row.known_streets_share and not row.model.inpainting):
+        raise ValueError(
+            f"--known-streets-share is {row.known_streets_share}, expected 0 to 1, and 0 without --inpainting"
+        )
     return row
 
 
@@ -240,6 +254,8 @@ def make_run_identity(
         identity |= {"sample_posterior": loss.sample_posterior}
     if row.model.inpainting:
         identity |= {"inpainting": True}
+    if row.known_streets_share:
+        identity |= {"known_streets_share": row.known_streets_share}
     if config.crop_repeats != 1:
         identity |= {"crop_repeats": config.crop_repeats}
     if config.round_weights:

@@ -113,12 +113,13 @@ class SamplingCheck:
     label: str
     count: int = 64
     num_inference_steps: int = 25
+    streets: bool = False
 
     @torch.no_grad()
     def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Return the validation loss and pictures of SHOWN generated scenes, with the same noise at each validation."""
         dit, device = cast(DiT, trainer.ema_model().eval()), trainer.device
-        arrays = load_held_out_latents(self.root, self.source, self.latents, self.label, self.count)
+        arrays = load_held_out_latents(self.root, self.source, self.latents, self.label, self.count, self.streets)
         arrays = {name: torch.from_numpy(value).to(device) for name, value in arrays.items()}
         generators = [make_keyed_generator(1, k) for k in range(len(arrays["label"]))]
         loss = float(trainer.loss(dit, arrays, generators)["loss"])
@@ -177,7 +178,9 @@ def load_cached_lvae(directory: str) -> LayoutVAE:
 
 
 @lru_cache(maxsize=1)
-def load_held_out_latents(root: str, source: str, latents: str, label: str, count: int) -> dict[str, np.ndarray]:
+def load_held_out_latents(
+    root: str, source: str, latents: str, label: str, count: int, streets: bool = False
+) -> dict[str, np.ndarray]:
     """Return the first latents of the test split, or of the training split if there is no test split.
 
     Args:
@@ -186,15 +189,16 @@ def load_held_out_latents(root: str, source: str, latents: str, label: str, coun
         latents: Directory with latents.json.
         label: Kind of label.
         count: Maximum number of scenes.
+        streets: Whether to read the latents of the streets, too.
 
     Returns:
-        Posteriors and labels {mean, logvar, label}.
+        Posteriors and labels {mean, logvar, label}, and latents of streets.
     """
     try:
         shards = find_shards(root, source=source, split="test")
     except ValueError:
         shards = find_shards(root, source=source, split="train")
-    read, parts, left = LatentReader(latents, label), [], count
+    read, parts, left = LatentReader(latents, label, streets), [], count
     for shard in shards:
         rows = np.arange(min(left, shard.read("scenes", ["scene_id"]).num_rows))
         parts.append(read(shard, rows))

@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
@@ -281,8 +281,53 @@ def add_sketched_ground(
     there = replace(grid, front_m=grid.front_m + offset_m[0], left_m=grid.left_m + offset_m[1])
     road, sidewalk = (mask & where for mask in draw_roads(roads, there))
     drawn = road | sidewalk
-    if not drawn.any():
-        return scene, drawn
+    return (put_streets(scene, road, sidewalk, level_m) if drawn.any() else scene), drawn
+
+
+def keep_streets(scene: Scene) -> tuple[Scene, np.ndarray]:
+    """Keep only the streets of a scene: terrain lies around them, at the height of the nearest street.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        The scene without objects, and the (rows, cols) bool mask of the pixels of roads and sidewalks. Without streets,
+        the scene has no ground.
+
+    Raises:
+        ValueError: The scene has no class road, sidewalk or terrain.
+    """
+    surface_m, classes = scene.surface()
+    names = scene.ground_classes
+    road, sidewalk = (
+        classes == names.index(name) if name in names else np.zeros_like(classes, bool) for name in (ROAD, SIDEWALK)
+    )
+    paved = road | sidewalk
+    nothing = np.zeros_like(scene.occupied)
+    bare = replace(scene.select(np.zeros(len(scene), bool)), occupied=nothing, height_m=np.zeros_like(scene.height_m))
+    if not paved.any():
+        return bare, paved
+    bare = put_streets(bare, road, sidewalk, 0.0)
+    _, (row, col) = cast(tuple, distance_transform_edt(~paved, return_indices=True))
+    return replace(bare, height_m=bare.occupied * surface_m[row, col].astype(np.float32)), paved
+
+
+def put_streets(scene: Scene, road: np.ndarray, sidewalk: np.ndarray, level_m: float) -> Scene:
+    """Replace ground by streets.
+
+    Args:
+        scene: Scene whose ground is known or extrapolated; without ground, the surroundings of the streets are terrain.
+        road: (rows, cols) bool mask of the roads.
+        sidewalk: (rows, cols) bool mask of the sidewalks.
+        level_m: Height of the ground if the scene has none (m).
+
+    Returns:
+        The scene with the streets.
+
+    Raises:
+        ValueError: The scene has no class road, sidewalk or terrain.
+    """
+    drawn = road | sidewalk
     if missing := [name for name in (ROAD, SIDEWALK, TERRAIN) if name not in scene.ground_classes]:
         raise ValueError(f"the ground of the model has no class {missing[0]}, so it cannot follow sketched roads")
     occupied, height_m = scene.occupied.copy(), scene.height_m.copy()
@@ -295,7 +340,7 @@ def add_sketched_ground(
         occupied[k] = np.where(drawn, own, occupied[k])
         height_m[k] = np.where(drawn & own | occupied[k] & ~scene.occupied[k], surface_m, height_m[k])
         height_m[k] *= occupied[k]
-    return replace(scene, occupied=occupied, height_m=height_m), drawn
+    return replace(scene, occupied=occupied, height_m=height_m)
 
 
 def check_sketch(roads: Sequence[Streets], scene: Scene) -> None:

@@ -224,6 +224,26 @@ def make_latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
     )
 
 
+def make_street_latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
+    """Return the schema of the table street_latents.
+
+    Args:
+        shape: (C, h, w) shape of the ground channels of one latent.
+
+    Returns:
+        Schema with the columns scene_id, ground and cells.
+    """
+    return _make_schema(
+        "One row per scene: the latent of its streets without any other content, from the layout VAE that latents.json "
+        "names. The ground around the streets is terrain.",
+        _SCENE_ID,
+        ("ground", pa.fixed_shape_tensor(pa.float16(), shape), "1",
+         "Mean of the ground channels of the latent: float16 (channel, row, col), C order."),
+        ("cells", pa.fixed_shape_tensor(pa.uint8(), shape[1:]), "",
+         "1 for each latent cell (row, col) that lies completely on roads and sidewalks, else 0."),
+    )
+
+
 def make_street_maps_schema(shape: tuple[int, int, int]) -> pa.Schema:
     """Return the schema of the table street_maps.
 

@@ -225,6 +225,8 @@ RULES: Mapping[str, Mapping[str, Callable[[pa.Table, str], None]]] = {
         "ground_classes": _validate_classes,
     },
     "latents": {"scene_id": _require_present, "mean": _validate_tensors, "logvar": _validate_tensors},
+    "street_latents": {"scene_id": _require_present, "ground": _validate_tensors},
+    "street_maps": {"map_id": _require_present, "distance_m": _validate_tensors},
 }
 
 
@@ -232,7 +234,8 @@ def validate_table(kind: str, table: pa.Table) -> None:
     """Validate the columns of a table that are present.
 
     Args:
-        kind: Name of the table: scenes, primitives, rasters or latents; other tables have no rules.
+        kind: Name of the table: scenes, primitives, rasters, latents,
+            street_latents or street_maps; other tables have no rules.
         table: Rows of one file; the columns have the types of the schema.
 
     Raises:

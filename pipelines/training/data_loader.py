@@ -288,6 +288,17 @@ def _read_latents(shard: Shard, latents_root: str, label: str) -> Arrays:
     return moments | {"label": label_indices(scenes, label)}
 
 
+@lru_cache(maxsize=2 * WINDOW_SHARDS)
+def _read_street_latents(shard: Shard, latents_root: str) -> Arrays:
+    table = Shard(latents_root, shard.source, shard.split, shard.number).read("street_latents")
+    if table["scene_id"].to_pylist() != shard.read("scenes", ["scene_id"])["scene_id"].to_pylist():
+        raise ValueError(
+            f"{shard.path('street_latents')} is not aligned with {shard.path('scenes')}; encode the latents again"
+        )
+    names = {"ground": "street_ground", "cells": "street_cells"}
+    return {name: table[column].combine_chunks().to_numpy_ndarray() for column, name in names.items()}
+
+
 LABEL_COLUMNS = ("vegetation_density", "vehicle_density", "free_pose")  # Columns that determine a label.
 
 
@@ -311,10 +322,15 @@ class LatentReader:
     Attributes:
         latents_root: Directory of the latents.
         label: Kind of label.
+        streets: Whether to read the latents of the streets, too.
     """
 
     latents_root: str
     label: str
+    streets: bool = False
 
     def __call__(self, shard: Shard, rows: np.ndarray, places: np.ndarray | None = None) -> Arrays:
-        return {name: values[rows] for name, values in _read_latents(shard, self.latents_root, self.label).items()}
+        arrays = _read_latents(shard, self.latents_root, self.label)
+        if self.streets:
+            arrays = arrays | _read_street_latents(shard, self.latents_root)
+        return {name: values[rows] for name, values in arrays.items()}

@@ -10,13 +10,15 @@ import numpy as np
 import pyarrow as pa
 import torch
 
+from models.composition.inpaint import find_region_cells
+from models.composition.road_sketch import ROAD, SIDEWALK, TERRAIN, keep_streets
 from models.lvae import LayoutVAE
 from models.tensors import make_layout_batch
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
 from pipelines.runtime.resources import find_device
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.tables import Shard, find_shards, make_latents_schema
+from pipelines.schema.tables import Shard, find_shards, make_latents_schema, make_street_latents_schema
 
 
 def digest_weights(model: torch.nn.Module) -> str:
@@ -46,8 +48,11 @@ class Encoder:
     channel.
     """
 
-    def __init__(self, lvae: str, output: str, shards: list[Shard], there: set[str], batch_size: int) -> None:
+    def __init__(
+        self, lvae: str, output: str, shards: list[Shard], there: set[str], batch_size: int, streets: bool
+    ) -> None:
         self.model, self.output, self.shards, self.batch_size = load_lvae(lvae), output, shards, batch_size
+        self.streets = streets
         self.there = there  # Files of an interrupted run.
         self.device = find_device()
         self.model.to(self.device)
@@ -65,9 +70,27 @@ class Encoder:
         mean, logvar = (np.concatenate(group) for group in zip(*parts, strict=True))
         return [scene.scene_id for scene in scenes], mean, logvar
 
+    @torch.no_grad()
+    def encode_streets(self, shard: Shard) -> pa.Table:
+        """Return the rows of the table street_latents of a shard."""
+        scenes, spec = shard.scenes(), self.model.spec
+        channels, size, _ = self.model.latent_shape
+        grounds, cells = [], []
+        for start in range(0, len(scenes), self.batch_size):
+            kept = [keep_streets(scene) for scene in scenes[start : start + self.batch_size]]
+            batch = make_layout_batch([scene for scene, _ in kept], spec).to(self.device)
+            grounds.append(self.model.encode(batch).mean[:, : channels // 2].half().cpu().numpy())
+            cells += [~find_region_cells(~paved, size) for _, paved in kept]
+        tensors = (np.concatenate(grounds), np.stack(cells).astype(np.uint8))
+        ids = pa.array([scene.scene_id for scene in scenes])
+        columns = [pa.FixedShapeTensorArray.from_numpy_ndarray(values) for values in tensors]
+        return pa.table([ids, *columns], schema=make_street_latents_schema(tensors[0].shape[1:]))
+
     def __call__(self, row: dict) -> dict:
         shard = self.shards[row["id"]]
         target = Shard(self.output, shard.source, shard.split, shard.number)
+        if self.streets and target.path("street_latents") not in self.there:
+            storage.write_parquet(self.encode_streets(shard), target.path("street_latents"))
         mean = None
         if target.path("latents") in self.there:
             with suppress(ValueError):  # A damaged file is written again.
@@ -95,6 +118,7 @@ def encode_latents(
     num_actors: int = 1,
     batch_size: int = 16,
     on_shard: Callable[[dict], None] | None = None,
+    streets: bool = False,
 ) -> dict:
     """Write latents and latents.json. To resume an interrupted run, call this function again.
 
@@ -107,24 +131,28 @@ def encode_latents(
         num_actors: Number of actors; each actor holds a model.
         batch_size: Number of scenes per forward pass.
         on_shard: Called with the row of each finished shard.
+        streets: Whether to write the table street_latents, too.
 
     Returns:
         Content of latents.json.
 
     Raises:
-        ValueError: The LVAE and the dataset have different LayoutSpecs, or the directory contains latents of another
-            LVAE.
+        ValueError: The LVAE and the dataset have different LayoutSpecs, the directory contains latents of another LVAE,
+            or latents of streets are requested although the latents mix ground and objects or lack a class.
     """
     model = load_lvae(lvae)
     dataset.spec.with_resolution(model.spec.grid.rows).require(model.spec, f"{lvae}")
+    if streets and (not model.config.split_latent or {ROAD, SIDEWALK, TERRAIN} - set(model.spec.ground_classes)):
+        raise ValueError(f"{lvae} has no separate latent for road, sidewalk and terrain; encode without streets")
     description, digest = storage.join_uri(output, "latents.json"), digest_weights(model)
     if storage.exists(description):
         found = storage.read_json(description)
         if found["lvae_digest"] != digest:
             raise ValueError(f"{output} holds latents of another LVAE ({found['lvae']}); choose another --output")
-        if found["complete"]:
+        if found["complete"] and (found.get("streets") or not streets):
             return found
     content = {"lvae": lvae, "lvae_digest": digest, "dataset": dataset.root, "complete": False}
+    content |= {"streets": True} if streets else {}
     storage.write_json(content, description)
     storage.clean_temporaries(storage.join_uri(output, "latents"))
 
@@ -132,10 +160,13 @@ def encode_latents(
     total: np.ndarray | float = 0.0
     square: np.ndarray | float = 0.0
     cells, counts, promised = 0, {}, {}
-    there = set(storage.list_files(storage.join_uri(output, "latents"), ".parquet"))
-    for row in map_actors(range(len(shards)), Encoder, (lvae, output, shards, there, batch_size), num_actors):
+    tables = ("latents", "street_latents")[: 1 + streets]
+    there = {path for table in tables for path in storage.list_files(storage.join_uri(output, table), ".parquet")}
+    arguments = lvae, output, shards, there, batch_size, streets
+    for row in map_actors(range(len(shards)), Encoder, arguments, num_actors):
         shard = shards[row["id"]]
-        promised[Shard(output, shard.source, shard.split, shard.number).path("latents")] = int(row["count"])
+        for table in tables:
+            promised[Shard(output, shard.source, shard.split, shard.number).path(table)] = int(row["count"])
         counts[row["split"]] = counts.get(row["split"], 0) + int(row["count"])
         if row["split"] == "train":
             total, square = total + row["sum"], square + row["square"]

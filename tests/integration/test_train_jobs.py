@@ -75,6 +75,30 @@ def test_encode_latents_match_lvae_and_scene_order(home):
     assert got.dtype == np.float16 and np.allclose(got, want, atol=2e-3 * np.abs(want).max())
 
 
+def test_encode_writes_the_latents_of_streets(home, tmp_path):
+    from jobs.encode_latents import Config
+    from jobs.implementation.encode_latents import encode
+    from models.composition.road_sketch import keep_streets
+    from models.tensors import make_layout_batch
+    from pipelines.training.data_loader import LatentReader
+    from pipelines.training.latents import load_lvae
+
+    root, lvae = str(home / "datasets/smoke"), str(home / "models/lvae-smoke")
+    found = encode(Config(dataset=root, lvae=lvae, output=str(tmp_path), streets=True))
+    assert found["complete"] and found["streets"]
+    shard = find_shards(root, split="test")[0]
+    arrays = LatentReader(str(tmp_path), "vegetation", streets=True)(shard, np.arange(2))
+    kept = [keep_streets(scene) for scene in shard.scenes([0, 1])]
+    model = load_lvae(lvae)
+    want = model.encode(make_layout_batch([scene for scene, _ in kept], model.spec)).mean.numpy()
+    got = arrays["street_ground"]
+    assert np.allclose(got, want[:, : len(want[0]) // 2], atol=2e-3 * np.abs(want).max())
+    size = got.shape[-1]
+    for cells, (scene, paved) in zip(arrays["street_cells"], kept, strict=True):
+        side = scene.grid.rows // size
+        assert np.array_equal(cells, paved.reshape(size, side, size, side).all(axis=(1, 3)))
+
+
 def test_train_logs_run_and_model_to_mlflow(home):
     from jobs.support.tracking import make_client
 

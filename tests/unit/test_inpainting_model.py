@@ -20,12 +20,13 @@ from models.sampling.diffusion import (
     SamplingSchedule,
     SceneNoise,
     join_known,
+    make_keyed_generator,
     sample,
     with_known,
 )
 from models.sampling.known_regions import NUM_UNIFORM, SHARE_BAND, SHARE_ONE_CONTENT, make_training_masks
 from models.sampling.repaint import RePaintConfig, TrainedInpainting
-from models.training import DiffusionLossConfig, make_dit_settings, make_dit_trainer
+from models.training import DiffusionLossConfig, make_diffusion_loss, make_dit_settings, make_dit_trainer
 
 SIZE = 8
 
@@ -232,3 +233,31 @@ def test_infinite_scene_has_the_blocks_of_the_large_scene(pipeline, order, overl
     # The large scene is generated in batches, which changes the rounding.
     assert np.mean(whole.occupied != large.occupied) < 1e-3 and len(whole) == len(large)
     assert np.abs(whole.center_m - large.center_m).max() < 0.01
+
+
+def test_known_streets_hold_latents_of_streets_only():
+    """The loss passes the ground of streets to the network, and has no error there."""
+    torch.manual_seed(0)
+    dit = DiT(channels=2, size=SIZE, width=32, depth=1, heads=2, prediction="v_prediction", inpainting=True)
+    count = 64
+    arrays = {"mean": torch.zeros(count, 2, SIZE, SIZE), "label": torch.zeros(count, dtype=torch.long)}
+    cells = torch.zeros(count, SIZE, SIZE, dtype=torch.uint8)
+    cells[:, 2] = 1
+    arrays |= {"street_ground": torch.full((count, 1, SIZE, SIZE), 7.0), "street_cells": cells}
+    seen = []
+
+    def network(noisy, timestep, label):
+        seen.append(noisy)
+        return torch.zeros_like(noisy[:, :2])
+
+    config = DiffusionLossConfig(sample_posterior=False, known_streets_share=0.5)
+    loss = make_diffusion_loss(dit, 0.0, config)
+    first = loss(network, arrays, [make_keyed_generator(0, k) for k in range(count)])["noise_error"]
+    _, _, known_ground, known_objects, is_ground, is_objects = seen[0].unbind(1)
+    streets = (known_ground == 7).flatten(1).any(1)
+    assert 0.3 < float(streets.float().mean()) < 0.7
+    assert not (known_ground == 7)[cells == 0].any() and not known_objects.any()
+    assert (is_ground[streets][:, 2] == 1).all() and not torch.equal(is_ground, is_objects)
+    without = replace(config, known_streets_share=0.0)
+    second = make_diffusion_loss(dit, 0.0, without)(network, arrays, [make_keyed_generator(0, k) for k in range(count)])
+    assert not (seen[1][:, 2] == 7).any() and float(first) < float(second["noise_error"])

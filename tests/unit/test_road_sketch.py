@@ -13,7 +13,14 @@ from scipy.ndimage import distance_transform_edt
 from jobs.implementation.outpaint_scenes import read_road_sketch
 from models.composition.block_grid import BlockGrid
 from models.composition.outpaint import BlockComposer, SceneBlock, check_roads
-from models.composition.road_sketch import RoadMap, SketchedRoad, add_sketched_ground, check_sketch, draw_roads
+from models.composition.road_sketch import (
+    RoadMap,
+    SketchedRoad,
+    add_sketched_ground,
+    check_sketch,
+    draw_roads,
+    keep_streets,
+)
 from models.layout import LayoutSpec
 from models.pipeline import PrITTIPipeline
 from models.scene import KITTI_GROUND_CLASSES, Grid
@@ -174,3 +181,19 @@ def test_released_model_builds_the_sketched_road():
         whole = pipeline.outpaint(scene, "medium-medium", num_blocks=(2, 0, 0, 0), roads=roads)
         shares.append(float(whole.occupied[ROAD][draw_roads([sketched], whole.grid)[0]].mean()))
     assert shares[0] > 0.95 and shares[1] < 0.7, shares
+
+
+def test_kept_streets_are_those_of_the_scene():
+    scene = random_scene(1, n=5, grid=SMALL)
+    kept, paved = keep_streets(scene)
+    surface_m, classes = scene.surface()
+    assert np.array_equal(paved, np.isin(classes, (ROAD, SIDEWALK))) and paved.any() and len(kept) == 0
+    for number in (ROAD, SIDEWALK):
+        assert np.array_equal(kept.occupied[number], classes == number)
+        assert np.allclose(kept.height_m[number][classes == number], surface_m[classes == number])
+    terrain = KITTI_GROUND_CLASSES.index("terrain")
+    assert np.array_equal(kept.occupied[terrain], ~paved) and kept.occupied.sum() == paved.size
+    nearest = distance_transform_edt(~paved, return_distances=False, return_indices=True)
+    assert np.allclose(kept.height_m.sum(axis=0), surface_m[tuple(nearest)])
+    bare, nothing = keep_streets(replace(scene, occupied=np.zeros_like(scene.occupied)))
+    assert not nothing.any() and not bare.occupied.any()

@@ -40,6 +40,8 @@ from pipelines.schema.tables import (
     Shard,
     make_latents_schema,
     make_rejects_table,
+    make_street_latents_schema,
+    make_street_maps_schema,
     read_scenes,
 )
 
@@ -51,6 +53,8 @@ SCHEMAS = {
     "rejects": REJECTS,
     "edits": EDITS,
     "latents": make_latents_schema((4, 8, 8)),
+    "street_latents": make_street_latents_schema((2, 8, 8)),
+    "street_maps": make_street_maps_schema((2, 64, 64)),
 }
 SETUP, COLUMNS = "Questions", "On disk"  # headings of SQL blocks that answer no question
 
