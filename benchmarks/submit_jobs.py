@@ -44,6 +44,7 @@ preprocess_scenes town --num-train 48 --num-test 24
 train_lvae smoke --dataset @/datasets/town --name small-lvae --steps 24
 encode_latents --dataset @/datasets/town --lvae @/models/small-lvae
 train_dit smoke --dataset @/datasets/town --name small --steps 24 --num-workers 2
+train_street_planner smoke --model @/models/pritti-small --output @/models/pritti-streets
 sample_scenes --model @/models/pritti-small --num-scenes 24 --num-inference-steps 4 --run small --output @/small
 sample_scenes --model town --num-scenes 24 --sampler dpm++ --num-inference-steps 10 --run town --output @/town
 outpaint_scenes --model town --input @/town --num-inference-steps 8 --extent-m 192 192

@@ -992,7 +992,7 @@ class PrITTIPipeline:
             seed: Seed of the run.
             index: Index of the scene within the run.
             overlap: Fraction of a block that overlaps its neighbour; it must correspond to a whole number of latent
-                cells. None: see `models.composition.outpaint.choose_arrangement`; 0.5 with `side`.
+                cells. None: see `models.composition.block_grid.choose_arrangement`; 0.5 with `side`.
             mode: "copy" copies the shifted latents of the neighbours. "reencode" transforms the decoded content of the
                 neighbours into the frame of the block and encodes it again. Object latents contain absolute centres,
                 which a copy does not change. "paper" is the outpainting of the paper: a copy, without blending of the

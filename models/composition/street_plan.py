@@ -1,9 +1,9 @@
 """Plan the streets of a city with a diffusion model, before its blocks are generated.
 
 Blocks that do not know each other cannot agree on streets. A street planner (models/street_planner.py) generates signed
-distances (street_distances.py) over windows of 256 m. It continues known parts. The first window knows the streets of
-the given scene. Each further window knows those of its predecessors, which cover half of a window on the axes through
-the first window, and three quarters elsewhere. Blocks then take the plan as known ground, like a map of all roads.
+distances (street_distances.py) over sections of 256 m. It continues known parts. The first section knows the streets of
+the given scene. Each further section knows those of its predecessors, which cover half of a section on the axes through
+the first section, and three quarters elsewhere. Blocks then take the plan as known ground, like a map of all roads.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ def convert_label(kind: str, label: str) -> str:
 
 
 class StreetPlan:
-    """An unbounded street plan that generates windows on demand. It does not depend on the order of requests.
+    """An unbounded street plan that generates sections on demand. It does not depend on the order of requests.
 
     Attributes:
-        windows: Distances (2, size, size) of the generated windows, by index (m).
+        sections: Distances (2, size, size) of the generated sections, by index (m).
 
     Args:
         planner: Street planner.
         given: Scene that the plan continues. Its grid must consist of whole pixels of the plan. None: nothing is given,
-            and the first window has its centre at the origin.
+            and the first section has its centre at the origin.
         label_at: Label of the streets at a place (`convert_label`); None: any.
         seed: Seed of the noise.
-        scene_index: Index of the scene. The noise depends on the seed, this index and the window.
+        scene_index: Index of the scene. The noise depends on the seed, this index and the section.
         num_inference_steps: Number of denoising steps; None: the default of the sampler.
         sketches: Sketched roads that the plan contains, in the frame of the given scene.
 
@@ -84,13 +84,13 @@ class StreetPlan:
         self.planner, self.label_at, self.seed, self.scene_index = planner, label_at, seed, scene_index
         self.sketches = tuple(sketches)
         size = planner.config.size
-        self.window_grid = BlockGrid(size, size // 2, rank_outward, None)
-        # First pixels of the first window, counted ahead from x = 0 and to the left from y = 0.
+        self.section_grid = BlockGrid(size, size // 2, rank_outward, None)
+        # First pixels of the first section, counted ahead from x = 0 and to the left from y = 0.
         self._first = -size // 2, -size // 2
         self._given, self._is_given = np.zeros((CHANNELS, size, size), np.float32), np.zeros((size, size), bool)
         if given is not None:
             self._set_given(given)
-        self.windows: dict[BlockIndex, np.ndarray] = {}
+        self.sections: dict[BlockIndex, np.ndarray] = {}
         self._owned: dict[BlockIndex, np.ndarray] = {}
         sampler = SchedulerConfig.ddpm(planner.diffusion).with_sampler(SAMPLER)
         steps = num_inference_steps or SAMPLERS[SAMPLER].num_inference_steps
@@ -99,13 +99,13 @@ class StreetPlan:
         self._steps = steps
 
     def _set_given(self, given: Scene) -> None:
-        """Put the given scene in the middle of the first window."""
+        """Put the given scene in the middle of the first section."""
         distance_m = measure_street_distances(*read_street_masks(given), given.grid.resolution_m)
-        size, (rows, cols) = self.window_grid.size, distance_m.shape[1:]
+        size, (rows, cols) = self.section_grid.size, distance_m.shape[1:]
         back_px, right_px = given.grid.back_m / PIXEL_M, given.grid.right_m / PIXEL_M
         if rows > size or cols > size or (size - rows) % 2 or (size - cols) % 2 or back_px % 1 or right_px % 1:
             raise ValueError(
-                f"scene {given.scene_id} has {given.grid}; a street plan continues scenes of at most {self.window_m:g}"
+                f"scene {given.scene_id} has {given.grid}; a street plan continues scenes of at most {self.section_m:g}"
                 f" m whose borders lie at multiples of {PIXEL_M:g} m"
             )
         row, col = (size - rows) // 2, (size - cols) // 2
@@ -116,13 +116,13 @@ class StreetPlan:
         self._is_given[middle] = (np.abs(distance_m) <= measure_border_distances(rows, cols)).all(axis=0)
 
     @property
-    def window_m(self) -> float:
-        """Side of a window (m)."""
-        return self.window_grid.size * PIXEL_M
+    def section_m(self) -> float:
+        """Side of a section (m)."""
+        return self.section_grid.size * PIXEL_M
 
-    def _find_window_grid(self, index: BlockIndex) -> Grid:
-        """Return the grid of the pixels of a window."""
-        size, step = self.window_grid.size, self.window_grid.step
+    def _find_section_grid(self, index: BlockIndex) -> Grid:
+        """Return the grid of the pixels of a section."""
+        size, step = self.section_grid.size, self.section_grid.step
         back, right = (first + k * step for first, k in zip(self._first, index, strict=True))
         return Grid((back + size) * PIXEL_M, (right + size) * PIXEL_M, PIXEL_M, size, size)
 
@@ -133,44 +133,44 @@ class StreetPlan:
         return Grid(front * PIXEL_M, left * PIXEL_M, PIXEL_M, front - back, left - right)
 
     def _owns(self, index: BlockIndex) -> np.ndarray:
-        """Return the (size, size) bool mask of the pixels that a window owns."""
+        """Return the (size, size) bool mask of the pixels that a section owns."""
         if index not in self._owned:
-            self._owned[index] = self.window_grid.owned_cells(index)
+            self._owned[index] = self.section_grid.owned_cells(index)
         return self._owned[index]
 
-    def list_windows(self, grid: Grid) -> list[BlockIndex]:
-        """List the windows from which the streets on a grid are drawn, without their predecessors.
+    def list_sections(self, grid: Grid) -> list[BlockIndex]:
+        """List the sections from which the streets on a grid are drawn, without their predecessors.
 
         Args:
             grid: Grid in the frame of block (0, 0), of any resolution.
 
         Returns:
-            Indices of the windows.
+            Indices of the sections.
         """
         cover, ranges = self._cover(grid), []
-        size, step = self.window_grid.size, self.window_grid.step
+        size, step = self.section_grid.size, self.section_grid.step
         for first, low_m, count in zip(
             self._first, (cover.back_m, cover.right_m), (cover.rows, cover.cols), strict=True
         ):
-            # Window k spans the pixels from first + k step to first + k step + size.
+            # Section k spans the pixels from first + k step to first + k step + size.
             low = round(low_m / PIXEL_M) - first
             ranges.append(range((low - size) // step + 1, -(-(low + count) // step)))
         found = product(*ranges)
-        return [k for k in found if self._owns(k)[cover.intersect(self._find_window_grid(k))[1]].any()]
+        return [k for k in found if self._owns(k)[cover.intersect(self._find_section_grid(k))[1]].any()]
 
     def list_predecessors(self, index: BlockIndex) -> list[BlockIndex]:
-        """List the windows that a window continues.
+        """List the sections that a section continues.
 
         Args:
-            index: Index of the window (steps ahead, steps to the left).
+            index: Index of the section (steps ahead, steps to the left).
 
         Returns:
-            Indices of the windows.
+            Indices of the sections.
         """
-        return [other for other, _ in self.window_grid.known_cells(index)]
+        return [other for other, _ in self.section_grid.known_cells(index)]
 
     def collect(self, grid: Grid) -> StreetDistances:
-        """Return the plan of a rectangle, and generate missing windows.
+        """Return the plan of a rectangle, and generate missing sections.
 
         Args:
             grid: Grid in the frame of block (0, 0), of any resolution.
@@ -180,13 +180,13 @@ class StreetPlan:
         """
         cover = self._cover(grid)
         distance_m = np.full((CHANNELS, cover.rows, cover.cols), -REACH_M, np.float32)
-        for index in self.list_windows(grid):
-            here, there = cover.intersect(self._find_window_grid(index))
-            np.copyto(distance_m[:, *here], self.get_window(index)[:, *there], where=self._owns(index)[there])
+        for index in self.list_sections(grid):
+            here, there = cover.intersect(self._find_section_grid(index))
+            np.copyto(distance_m[:, *here], self.get_section(index)[:, *there], where=self._owns(index)[there])
         return StreetDistances(cover.front_m, cover.left_m, distance_m)
 
     def draw(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-        """Draw the streets on a grid, and generate missing windows.
+        """Draw the streets on a grid, and generate missing sections.
 
         Args:
             grid: Grid in the frame of block (0, 0).
@@ -204,47 +204,47 @@ class StreetPlan:
         """
         return
 
-    def get_window(self, index: BlockIndex) -> np.ndarray:
-        """Return the distances of a window; generate its missing predecessors and the window.
+    def get_section(self, index: BlockIndex) -> np.ndarray:
+        """Return the distances of a section; generate its missing predecessors and the section.
 
         Args:
-            index: Index of the window (steps ahead, steps to the left).
+            index: Index of the section (steps ahead, steps to the left).
 
         Returns:
             (2, size, size) float32 distances (m).
         """
-        waiting = [index]  # A loop, because distant windows have thousands of predecessors.
+        waiting = [index]  # A loop, because distant sections have thousands of predecessors.
         while waiting:
-            missing = [other for other in self.list_predecessors(waiting[-1]) if other not in self.windows]
-            if missing and waiting[-1] not in self.windows:
+            missing = [other for other in self.list_predecessors(waiting[-1]) if other not in self.sections]
+            if missing and waiting[-1] not in self.sections:
                 waiting += missing
                 continue
             last = waiting.pop()
-            if last not in self.windows:
-                self.windows[last] = self._generate_window(last)
-        return self.windows[index]
+            if last not in self.sections:
+                self.sections[last] = self._generate_section(last)
+        return self.sections[index]
 
-    def put_window(self, index: BlockIndex, distance_m: np.ndarray) -> None:
-        """Store a window that another process has generated.
+    def put_section(self, index: BlockIndex, distance_m: np.ndarray) -> None:
+        """Store a section that another process has generated.
 
         Args:
-            index: Index of the window.
+            index: Index of the section.
             distance_m: (2, size, size) distances (m).
         """
-        self.windows[index] = distance_m
+        self.sections[index] = distance_m
 
     def _find_known(self, index: BlockIndex) -> tuple[np.ndarray, np.ndarray]:
-        """Return the known distances (2, size, size) of a window, and the mask (size, size) of the known pixels."""
-        size = self.window_grid.size
+        """Return the known distances (2, size, size) of a section, and the mask (size, size) of the known pixels."""
+        size = self.section_grid.size
         known_m, is_known = np.zeros((CHANNELS, size, size), np.float32), np.zeros((size, size), bool)
         if index == (0, 0):
             known_m, is_known = self._given.copy(), self._is_given.copy()
-        for other, cells in self.window_grid.known_cells(index):
-            here, there = self.window_grid.overlap_cells(index, other), self.window_grid.overlap_cells(other, index)
-            np.copyto(known_m[:, *here], self.windows[other][:, *there], where=cells[here])
+        for other, cells in self.section_grid.known_cells(index):
+            here, there = self.section_grid.overlap_cells(index, other), self.section_grid.overlap_cells(other, index)
+            np.copyto(known_m[:, *here], self.sections[other][:, *there], where=cells[here])
             is_known |= cells
         if self.sketches:
-            grid = self._find_window_grid(index)
+            grid = self._find_section_grid(index)
             side = round(PIXEL_M / SKETCH_RESOLUTION_M)
             fine = replace(grid, resolution_m=SKETCH_RESOLUTION_M, rows=grid.rows * side, cols=grid.cols * side)
             road, sidewalk = draw_roads(self.sketches, fine)
@@ -254,13 +254,13 @@ class StreetPlan:
             is_known |= is_sketched
         return known_m, is_known
 
-    def _generate_window(self, index: BlockIndex) -> np.ndarray:
+    def _generate_section(self, index: BlockIndex) -> np.ndarray:
         known_m, is_known = self._find_known(index)
         if is_known.all():
             return known_m
         config, device = self.planner.config, self.planner.device
         shift, scale = (torch.tensor(value, device=device)[:, None, None] for value in (config.shift, config.scale))
-        grid = self._find_window_grid(index)
+        grid = self._find_section_grid(index)
         middle = (grid.front_m + grid.back_m) / 2, (grid.left_m + grid.right_m) / 2
         name = self.label_at(*middle) if self.label_at else f"{ANY}-{ANY}-free"
         label = torch.tensor([find_label_index(LABEL_KIND, name)], device=device)

@@ -139,11 +139,11 @@ class OutpaintRequest(Request):
 
 
 @dataclass(frozen=True, order=True)
-class Window:
-    """A window of the street plan of a scene.
+class Section:
+    """A section of the street plan of a scene.
 
     Attributes:
-        ahead: Number of steps ahead of the first window.
+        ahead: Number of steps ahead of the first section.
         left: Number of steps to its left.
     """
 
@@ -151,21 +151,21 @@ class Window:
     left: int
 
 
-Part = BlockIndex | Window  # What a task of a scene makes or needs.
+Part = BlockIndex | Section  # What a task of a scene makes or needs.
 
 
 @dataclass(frozen=True)
-class WindowTask:
-    """A window of a street plan to generate.
+class SectionTask:
+    """A section of a street plan to generate.
 
     Attributes:
         number: Number of the scene in the run.
-        window: The window.
-        needs: Windows that this window continues.
+        section: The section.
+        needs: Sections that this section continues.
     """
 
     number: int
-    window: Window
+    section: Section
     needs: frozenset[Part]
 
 
@@ -176,7 +176,7 @@ class BlockBatch:
     Attributes:
         number: Number of the scene in the run.
         indices: Indices of the blocks.
-        needs: Blocks that the batch depends on, and windows of the street plan.
+        needs: Blocks that the batch depends on, and sections of the street plan.
     """
 
     number: int
@@ -203,7 +203,7 @@ def list_batches(
     block_grid: BlockGrid,
     number: int,
     batch_size: int,
-    windows: Mapping[BlockIndex, Sequence[Window]] | None = None,
+    sections: Mapping[BlockIndex, Sequence[Section]] | None = None,
 ) -> list[BlockBatch]:
     """List the batches of a scene in an order that respects dependencies; the input block is not included.
 
@@ -213,7 +213,7 @@ def list_batches(
         block_grid: Block grid.
         number: Number of the scene in the run.
         batch_size: Maximum number of blocks per batch.
-        windows: Windows of the street plan that each block needs; None: there is no plan.
+        sections: Sections of the street plan that each block needs; None: there is no plan.
 
     Returns:
         Batches.
@@ -223,30 +223,30 @@ def list_batches(
         for start in range(0, len(group), batch_size):
             indices = tuple(group[start : start + batch_size])
             needs = frozenset(other for index in indices for other, _ in block_grid.known_cells(index)) - {(0, 0)}
-            streets = frozenset(window for index in indices for window in (windows or {}).get(index, ()))
+            streets = frozenset(section for index in indices for section in (sections or {}).get(index, ()))
             listed.append(BlockBatch(number, indices, needs | streets))
     return listed
 
 
-def list_windows(plan: StreetPlan, wanted: Iterable[Window], number: int) -> list[WindowTask]:
-    """List windows of a street plan and their predecessors, in an order that respects dependencies.
+def list_sections(plan: StreetPlan, wanted: Iterable[Section], number: int) -> list[SectionTask]:
+    """List sections of a street plan and their predecessors, in an order that respects dependencies.
 
     Args:
         plan: Street plan.
-        wanted: Windows that are needed.
+        wanted: Sections that are needed.
         number: Number of the scene in the run.
 
     Returns:
-        Windows.
+        Sections.
     """
     needs: dict[BlockIndex, list[BlockIndex]] = {}
-    waiting = [(window.ahead, window.left) for window in wanted]
+    waiting = [(section.ahead, section.left) for section in wanted]
     while waiting:
         if (index := waiting.pop()) not in needs:
             needs[index] = plan.list_predecessors(index)
             waiting += needs[index]
     ordered = sorted(needs, key=lambda index: (rank_outward(index), index))
-    return [WindowTask(number, Window(*index), frozenset(Window(*one) for one in needs[index])) for index in ordered]
+    return [SectionTask(number, Section(*index), frozenset(Section(*one) for one in needs[index])) for index in ordered]
 
 
 # ------------------------------------------------------------------------------------------------------------ blocks
@@ -265,21 +265,21 @@ def make_block_path(directory: str, index: BlockIndex) -> str:
     return storage.join_uri(directory, f"{index[0]:+05d}{index[1]:+05d}.safetensors")
 
 
-def make_window_path(directory: str, window: Window) -> str:
-    """Return the path of the file of a window of a street plan.
+def make_section_path(directory: str, section: Section) -> str:
+    """Return the path of the file of a section of a street plan.
 
     Args:
         directory: Directory of the blocks of the scene.
-        window: The window.
+        section: The section.
 
     Returns:
         Path of a .safetensors file.
     """
-    return storage.join_uri(directory, f"streets{window.ahead:+05d}{window.left:+05d}.safetensors")
+    return storage.join_uri(directory, f"streets{section.ahead:+05d}{section.left:+05d}.safetensors")
 
 
-def read_window(path: str) -> np.ndarray:
-    """Read the distances of a window of a street plan.
+def read_section(path: str) -> np.ndarray:
+    """Read the distances of a section of a street plan.
 
     Args:
         path: Path of the .safetensors file.
@@ -354,36 +354,36 @@ class Outpainter:
         """Return the block grid for the latent size of the model."""
         return self.request.make_block_grid(self.pipeline.latent_shape[-1])
 
-    def load_plan(self, number: int, windows: Iterable[Window]) -> StreetPlan:
+    def load_plan(self, number: int, sections: Iterable[Section]) -> StreetPlan:
         """Return the street plan of a scene.
 
         Args:
             number: Number of the scene in the run.
-            windows: Windows that have been generated and are needed.
+            sections: Sections that have been generated and are needed.
 
         Returns:
-            The plan with these windows.
+            The plan with these sections.
         """
         if number not in self.plans:
             self.plans = {number: make_plan(self.pipeline, self.request, self.load_scene(number), number)}
         plan = self.plans[number]
-        for window in windows:
-            index = (window.ahead, window.left)
-            if index not in plan.windows:
-                path = make_window_path(self.request.blocks_directory(number), window)
-                plan.put_window(index, read_window(path))
+        for section in sections:
+            index = (section.ahead, section.left)
+            if index not in plan.sections:
+                path = make_section_path(self.request.blocks_directory(number), section)
+                plan.put_section(index, read_section(path))
         return plan
 
-    def generate_window(self, task: WindowTask) -> None:
-        """Generate a window of a street plan and write it to a file.
+    def generate_section(self, task: SectionTask) -> None:
+        """Generate a section of a street plan and write it to a file.
 
         Args:
-            task: Window to generate.
+            task: Section to generate.
         """
-        plan = self.load_plan(task.number, (one for one in task.needs if isinstance(one, Window)))
-        distance_m = plan.get_window((task.window.ahead, task.window.left))
+        plan = self.load_plan(task.number, (one for one in task.needs if isinstance(one, Section)))
+        distance_m = plan.get_section((task.section.ahead, task.section.left))
         data = save({"distance_m": torch.from_numpy(distance_m.copy())})
-        path = make_window_path(self.request.blocks_directory(task.number), task.window)
+        path = make_section_path(self.request.blocks_directory(task.number), task.section)
         storage.write_whole(path, lambda stream: stream.write(data))
 
     def load_scene(self, number: int) -> Scene:
@@ -434,8 +434,8 @@ class Outpainter:
         parts = sorted(part for part in batch.needs if isinstance(part, tuple))
         composer, given, known = self.load_blocks(batch.number, parts)
         if request.plan_streets:
-            windows = (part for part in batch.needs if isinstance(part, Window))
-            composer.roads = [*request.roads, self.load_plan(batch.number, windows)]
+            sections = (part for part in batch.needs if isinstance(part, Section))
+            composer.roads = [*request.roads, self.load_plan(batch.number, sections)]
         kind = self.pipeline.dit.config.label
         label = request.labels_map or request.label or find_scene_label(given, kind)
         blocks = generate_blocks(
@@ -506,8 +506,9 @@ class Outpainter:
             storage.write_text(render_city_html(name, grids), make_page_path(request, number, "index.html"))
         if request.plan_streets:
             plan = self.load_plan(number, ())
-            grid = widen_grid(composer.find_grid(self.block_grid.indices()), given.grid)
-            picture = draw_plan(self.load_plan(number, (Window(*k) for k in plan.list_windows(grid))), grid)
+            whole = composer.find_grid(self.block_grid.indices())
+            plan = self.load_plan(number, (Section(*index) for index in plan.list_sections(whole)))
+            picture = draw_plan(plan, whole, given.grid)
             storage.write_whole(make_plan_path(request, number), lambda stream: stream.write(picture))
         storage.write_parquet(pa.Table.from_pylist(rows), make_blocks_table_path(request, number))
         storage.delete_directory(request.blocks_directory(number))
@@ -553,7 +554,7 @@ def make_blocks_table_path(request: OutpaintRequest, number: int) -> str:
 
 
 def make_plan(pipeline: PrITTIPipeline, request: OutpaintRequest, given: Scene, number: int) -> StreetPlan:
-    """Return the street plan of a scene, without generated windows.
+    """Return the street plan of a scene, without generated sections.
 
     Args:
         pipeline: Pipeline with a street planner.
@@ -572,33 +573,23 @@ def make_plan(pipeline: PrITTIPipeline, request: OutpaintRequest, given: Scene, 
     return pipeline.plan_streets(given, label_at, request.seed, number, list_sketches(request.roads))
 
 
-def widen_grid(whole: Grid, first: Grid) -> Grid:
-    """Return the grid of the picture of a street plan, whose middle is that of the given scene.
-
-    Args:
-        whole: Grid of the city.
-        first: Grid of the given scene.
-
-    Returns:
-        Smallest grid that covers the city, with pixels of PLAN_PIXEL_M.
-    """
-    ahead_m, left_m = (first.front_m + first.back_m) / 2, (first.left_m + first.right_m) / 2
-    reach = max(whole.front_m - ahead_m, ahead_m - whole.back_m), max(whole.left_m - left_m, left_m - whole.right_m)
-    rows, cols = (2 * round(one / PLAN_PIXEL_M) for one in reach)
-    return Grid(ahead_m + rows / 2 * PLAN_PIXEL_M, left_m + cols / 2 * PLAN_PIXEL_M, PLAN_PIXEL_M, rows, cols)
-
-
-def draw_plan(plan: StreetPlan, grid: Grid) -> bytes:
+def draw_plan(plan: StreetPlan, whole: Grid, first: Grid) -> bytes:
     """Draw a street plan as a map that `--road-sketch` accepts: white roads, grey sidewalks, black elsewhere.
 
     Args:
         plan: Street plan.
-        grid: Grid of the picture.
+        whole: Grid of the city.
+        first: Grid of the given scene, whose middle is the middle of the picture.
 
     Returns:
-        PNG file.
+        PNG file with pixels of PLAN_PIXEL_M. It covers the city and is black outside.
     """
-    road, paved = plan.draw(grid)
+    ahead_m, left_m = (first.front_m + first.back_m) / 2, (first.left_m + first.right_m) / 2
+    reach = max(whole.front_m - ahead_m, ahead_m - whole.back_m), max(whole.left_m - left_m, left_m - whole.right_m)
+    rows, cols = (2 * round(one / PLAN_PIXEL_M) for one in reach)
+    grid = Grid(ahead_m + rows / 2 * PLAN_PIXEL_M, left_m + cols / 2 * PLAN_PIXEL_M, PLAN_PIXEL_M, rows, cols)
+    inside = whole.contains(grid.x_m()[:, None], grid.y_m()[None, :])
+    road, paved = (mask & inside for mask in plan.collect(whole).draw(grid))
     stream = io.BytesIO()
     Image.fromarray(np.where(road, 255, np.where(paved, 128, 0)).astype(np.uint8)).save(stream, "png")
     return stream.getvalue()
@@ -668,7 +659,7 @@ def outpaint_scenes(
     files = set(storage.list_files(parts[0], ".safetensors"))
     unwritten = {shard.number for shard in find_unwritten(promised)}
     waiting, missing, done = [], [], {}
-    windows: list[WindowTask] = []
+    sections: list[SectionTask] = []
     for number in range(len(chosen)):
         left = [k for k in range(len(tiles)) if number * len(tiles) + k in unwritten]
         if not left and storage.exists(make_blocks_table_path(request, number)):
@@ -677,17 +668,18 @@ def outpaint_scenes(
         directory = request.blocks_directory(number)
         there = {index for index in block_grid.indices() if make_block_path(directory, index) in files}
         done[number] = set(there)
-        streets: dict[BlockIndex, list[Window]] = {}
+        streets: dict[BlockIndex, list[Section]] = {}
         if request.plan_streets:
             shard, row = chosen[number]
             given = resample_to_model_grid(shard.scenes([row])[0], pipeline.spec)
             plan = make_plan(pipeline, request, given, number)
             grids = {index: composer.find_grid([index]) for index in block_grid.indices() if index != (0, 0)}
-            streets = {index: [Window(*k) for k in plan.list_windows(grid)] for index, grid in grids.items()}
-            needed = list_windows(plan, set().union(*streets.values()), number)
-            written = {task.window for task in needed if make_window_path(directory, task.window) in files}
+            streets = {index: [Section(*k) for k in plan.list_sections(grid)] for index, grid in grids.items()}
+            whole = plan.list_sections(composer.find_grid(block_grid.indices()))
+            needed = list_sections(plan, {Section(*index) for index in whole}, number)
+            written = {task.section for task in needed if make_section_path(directory, task.section) in files}
             done[number] |= written
-            windows += [task for task in needed if task.window not in written]
+            sections += [task for task in needed if task.section not in written]
         batches = list_batches(block_grid, number, request.batch_size, streets)
         waiting += [batch for batch in batches if not there.issuperset(batch.indices)]
     if on_blocks:
@@ -696,7 +688,7 @@ def outpaint_scenes(
     if request.tile_m is not None:  # Complete row after row of tiles.
         waiting.sort(key=lambda batch: (batch.number, batch.indices[0][0] // 2, block_grid.rank(batch.indices[0])))
     if done:
-        run_batches(request, chosen, waiting, windows, missing, done, num_actors, on_blocks)
+        run_batches(request, chosen, waiting, sections, missing, done, num_actors, on_blocks)
     require_written(promised)
     return [make_blocks_table_path(request, number) for number in range(len(chosen))]
 
@@ -705,7 +697,7 @@ def run_batches(
     request: OutpaintRequest,
     chosen: list[tuple[Shard, int]],
     waiting: list[BlockBatch],
-    windows: list[WindowTask],
+    sections: list[SectionTask],
     tiles: list[TileTask],
     done: dict[int, set[Part]],
     num_actors: int,
@@ -717,9 +709,9 @@ def run_batches(
         request: Options of outpainting.
         chosen: Shard and row of each selected scene.
         waiting: Batches to generate.
-        windows: Windows of street plans to generate.
+        sections: Sections of street plans to generate.
         tiles: Tiles to write.
-        done: Finished blocks and windows by scene number.
+        done: Finished blocks and sections by scene number.
         num_actors: Maximum number of actors.
         on_blocks: Called with the number of blocks of each finished batch.
     """
@@ -731,7 +723,7 @@ def run_batches(
     count = min(num_actors, max(len(waiting), len(done)), require_room(need, 1, "an actor (Outpainter)"))
     workers: list[Any] = [actor.remote(request, chosen) for _ in range(count)]
     try:
-        schedule_batches(workers, waiting, windows, tiles, done, on_blocks)
+        schedule_batches(workers, waiting, sections, tiles, done, on_blocks)
     finally:  # The traceback of an error references the actors. Without ray.kill, the actors would keep their CPUs.
         for worker in workers:
             ray.kill(worker)
@@ -740,7 +732,7 @@ def run_batches(
 def schedule_batches(
     workers: list,
     waiting: list[BlockBatch],
-    windows: list[WindowTask],
+    sections: list[SectionTask],
     tiles: list[TileTask],
     done: dict[int, set[Part]],
     on_blocks: Callable[[int], None] | None,
@@ -753,21 +745,21 @@ def schedule_batches(
     Args:
         workers: Actor handles.
         waiting: Batches to generate; the function empties the list.
-        windows: Windows of street plans to generate; the function empties the list.
+        sections: Sections of street plans to generate; the function empties the list.
         tiles: Tiles to write; the function empties the list.
-        done: Finished blocks and windows by scene number; the function adds the new ones.
+        done: Finished blocks and sections by scene number; the function adds the new ones.
         on_blocks: Called with the number of blocks of each finished batch.
     """
     idle: list = []
     running: dict[ray.ObjectRef, tuple] = {worker.__ray_ready__.remote(): (None, worker) for worker in workers}
-    left = dict.fromkeys(done, 0) | Counter(task.number for task in (*waiting, *windows, *tiles))
+    left = dict.fromkeys(done, 0) | Counter(task.number for task in (*waiting, *sections, *tiles))
     whole = [number for number, tasks_left in left.items() if not tasks_left]
-    while waiting or windows or tiles or whole or any(task is not None for task, _ in running.values()):
-        while idle and (task := pop_ready_task(waiting, windows, tiles, whole, done)) is not None:
+    while waiting or sections or tiles or whole or any(task is not None for task, _ in running.values()):
+        while idle and (task := pop_ready_task(waiting, sections, tiles, whole, done)) is not None:
             worker = idle.pop()
             calls = {
                 BlockBatch: worker.generate,
-                WindowTask: worker.generate_window,
+                SectionTask: worker.generate_section,
                 TileTask: worker.write_tile,
                 int: worker.finish,
             }
@@ -781,9 +773,9 @@ def schedule_batches(
             done[task.number].update(task.indices)
             if on_blocks:
                 on_blocks(len(task.indices))
-        if isinstance(task, WindowTask):
-            done[task.number].add(task.window)
-        if isinstance(task, (BlockBatch, WindowTask, TileTask)):
+        if isinstance(task, SectionTask):
+            done[task.number].add(task.section)
+        if isinstance(task, (BlockBatch, SectionTask, TileTask)):
             left[task.number] -= 1
             if not left[task.number]:
                 whole.append(task.number)
@@ -791,26 +783,26 @@ def schedule_batches(
 
 def pop_ready_task(
     waiting: list[BlockBatch],
-    windows: list[WindowTask],
+    sections: list[SectionTask],
     tiles: list[TileTask],
     whole: list[int],
     done: Mapping[int, set[Part]],
-) -> BlockBatch | WindowTask | TileTask | int | None:
+) -> BlockBatch | SectionTask | TileTask | int | None:
     """Remove and return the first task whose dependencies are done.
 
     Args:
-        waiting: Batches to generate. Batches whose windows are done are generated before further windows.
-        windows: Windows of street plans to generate.
+        waiting: Batches to generate. Batches whose sections are done are generated before further sections.
+        sections: Sections of street plans to generate.
         tiles: Tiles to write. Tiles whose blocks are done are written before further blocks are generated.
         whole: Numbers of the scenes in which all tiles are written.
-        done: Finished blocks and windows by scene number.
+        done: Finished blocks and sections by scene number.
 
     Returns:
-        A batch, a window, a tile, or the number of a scene to finish. None: no task is ready.
+        A batch, a section, a tile, or the number of a scene to finish. None: no task is ready.
     """
     if whole:
         return whole.pop(0)
-    for tasks in (tiles, waiting, windows):
+    for tasks in (tiles, waiting, sections):
         for position, task in enumerate(tasks):
             if task.needs <= done[task.number]:
                 return tasks.pop(position)

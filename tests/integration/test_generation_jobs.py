@@ -10,7 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import trimesh
-from helpers import kill_ray_workers
+from helpers import kill_ray_workers, tiny_planner
+from PIL import Image
 from scipy.spatial import cKDTree
 
 from models.scene import DENSITIES, Scene
@@ -326,6 +327,48 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
     (path,) = outpaint_scenes(request("outward", order="outward", num_blocks=(1, 0, 0, 0)), chosen)
     (outward,) = storage.read_parquet(path).to_pylist()[1:]
     assert outward["ahead"] == 1
+
+
+def test_outpaint_follows_a_street_plan(smoke, samples, tmp_path):
+    from models.composition.road_sketch import RoadMap
+    from models.pipeline import PrITTIPipeline
+    from models.sampling.repaint import RePaintConfig
+    from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
+    from pipelines.schema.scene_subset import SceneSubset
+
+    pipeline = PrITTIPipeline.from_pretrained(smoke / "models/pritti-smoke")
+    pipeline.register_modules(street_planner=tiny_planner())
+    pipeline.save_pretrained(tmp_path / "model")
+    chosen = SceneSubset(str(samples), "generated-samples", None, 1, "first")
+    repaint = RePaintConfig(num_inference_steps=3, jump_length=1, resamplings=1)
+    places = str(tmp_path / "model"), str(tmp_path / "out")
+    request = OutpaintRequest(*places, "street", "low", 0, 0.25, "reencode", repaint, 1.0, (3, 0, 0, 1), "colours")
+
+    class Stop(Exception):
+        pass
+
+    def stop(blocks: int) -> None:
+        if blocks:
+            raise Stop
+
+    with pytest.raises(Stop):
+        outpaint_scenes(request, chosen, on_blocks=stop)
+    assert list((tmp_path / "out/blocks").rglob("streets*.safetensors"))
+    outpaint_scenes(request, chosen, num_actors=2)
+    (whole,) = read_scenes(str(tmp_path / "out"))
+    given = next(iter(read_scenes(str(samples), "generated-samples")))
+    truth = pipeline.outpaint(
+        given, "low", 0, 0, 0.25, "reencode", (3, 0, 0, 1), repaint, order="colours", free_blocks="none"
+    )
+    assert np.array_equal(whole.occupied, truth.occupied)
+    classes = np.asarray(Image.open(tmp_path / "out/street_plans/street/generated-street-0-0000000.png")) // 127
+    # Reach from the middle of the given scene: 2.75 blocks ahead, 1.25 blocks to the left.
+    assert classes.shape == (2 * 176, 2 * 80) and set(np.unique(classes)) == {0, 1, 2}
+    drawn, _ = RoadMap.from_classes((classes == 2).astype(np.uint8), 1.0, (32.0, 0.0)).draw(given.grid)
+    road = given.occupied[given.ground_classes.index("road")]
+    assert (drawn & road).sum() > 0.8 * road.sum()
+    with pytest.raises(ValueError, match="other options"):
+        outpaint_scenes(replace(request, plan_streets=False), chosen)
 
 
 def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):

@@ -1,4 +1,4 @@
-"""Tests of street plans: signed distances, known parts, windows, and outpainting along a plan."""
+"""Tests of street plans: signed distances, known parts, sections, and outpainting along a plan."""
 
 from dataclasses import replace
 
@@ -138,7 +138,7 @@ def test_turned_maps_are_all_symmetries():
 def test_plan_continues_the_given_scene():
     street = make_street()
     plan = StreetPlan(tiny_planner(), street)
-    assert plan.window_m == 128.0
+    assert plan.section_m == 128.0
     road, paved = plan.draw(street.grid)
     inner = slice(4, -4)
     assert np.array_equal(road[inner, inner], read_street_masks(street)[0][inner, inner])
@@ -159,20 +159,20 @@ def test_plan_is_independent_of_the_order_of_requests():
     assert all(np.array_equal(a[:80, :90], b) for a, b in zip(whole, first[1], strict=True))
 
 
-def test_windows_keep_what_their_predecessors_planned():
+def test_sections_keep_what_their_predecessors_planned():
     plan = StreetPlan(tiny_planner(), make_street())
     for index in ((0, 0), (1, 0), (0, 1), (1, 1), (2, 1)):
-        window = plan.get_window(index)
-        assert np.isfinite(window).all() and np.abs(window).max() <= REACH_M
+        section = plan.get_section(index)
+        assert np.isfinite(section).all() and np.abs(section).max() <= REACH_M
         for other in plan.list_predecessors(index):
-            here, there = plan.window_grid.overlap_cells(index, other), plan.window_grid.overlap_cells(other, index)
-            assert np.array_equal(window[:, *here], plan.get_window(other)[:, *there])
+            here, there = plan.section_grid.overlap_cells(index, other), plan.section_grid.overlap_cells(other, index)
+            assert np.array_equal(section[:, *here], plan.get_section(other)[:, *there])
     assert set(plan.list_predecessors((2, 1))) == {(1, 0), (1, 1), (2, 0)}
-    # A process that has only the predecessors of a window generates the same window.
+    # A process that has only the predecessors of a section generates the same section.
     again = StreetPlan(plan.planner, make_street())
     for other in plan.list_predecessors((2, 1)):
-        again.put_window(other, plan.windows[other])
-    assert np.array_equal(again.get_window((2, 1)), plan.windows[2, 1]) and len(again.windows) == 4
+        again.put_section(other, plan.sections[other])
+    assert np.array_equal(again.get_section((2, 1)), plan.sections[2, 1]) and len(again.sections) == 4
 
 
 def test_plan_contains_sketched_roads():
@@ -191,7 +191,7 @@ def test_plan_asks_for_the_label_of_each_place():
         return convert_label("joint", "low-high")
 
     plan = StreetPlan(tiny_planner(), make_street(), label_at)
-    plan.get_window((1, 0))
+    plan.get_section((1, 0))
     assert asked == [(32.0, 0.0), (96.0, 0.0)]
     assert convert_label("joint", "low-high") == "low-high-free" == convert_label("partial", "low-high")
     assert convert_label("vegetation", "low") == "low-any-free" and convert_label("none", "any") == "any-any-free"
