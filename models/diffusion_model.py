@@ -75,11 +75,11 @@ def make_noise_shares(schedule: Diffusion) -> Tensor:
     return torch.stack([(1 - alpha_bar).sqrt(), alpha_bar.sqrt()], dim=1).float()
 
 
-def parse_schedule(schedule: Diffusion | Mapping[str, Any]) -> Diffusion:
+def parse_schedule(schedule: Any) -> Diffusion:
     """Check the entry `schedule` of a stored config.
 
     Args:
-        schedule: The entry.
+        schedule: The entry, an object or a Diffusion.
 
     Returns:
         The noise schedule.

@@ -14,8 +14,8 @@ from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.terminal import print_table
 from jobs.sweep_samplers import Config
+from models.configured_pipeline import check_noise_scaling
 from models.labels import list_usual_labels
-from models.pipeline import check_noise_scaling
 from models.sampling.diffusion import Diffusion
 from models.sampling.schedulers import SAMPLERS
 from pipelines.evaluation.evaluate import compare_datasets

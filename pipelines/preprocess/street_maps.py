@@ -6,7 +6,7 @@ they show one or two junctions.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,12 +100,25 @@ def write_town_maps(town: TownMaps) -> int:
     """
     pixels = round(MAP_M / RESOLUTION_M)
     grid = Grid(MAP_M, MAP_M / 2, RESOLUTION_M, pixels, pixels)
-    rows = [make_row(scene) for scene in make_large_crops(town.town_seed, town.count, grid)]
+    return write_street_maps(make_large_crops(town.town_seed, town.count, grid), town.shard)
+
+
+def write_street_maps(scenes: Iterable[Scene], shard: Shard) -> int:
+    """Write a shard of the table `street_maps`.
+
+    Args:
+        scenes: Crops of MAP_M x MAP_M, one per map.
+        shard: The shard.
+
+    Returns:
+        Number of maps.
+    """
+    rows = [make_row(scene) for scene in scenes]
     distances = np.stack([row.pop("distance_m") for row in rows])
     schema = make_street_maps_schema((CHANNELS, MAP_PX, MAP_PX))
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     columns["distance_m"] = pa.FixedShapeTensorArray.from_numpy_ndarray(distances)
-    storage.write_parquet(pa.table(columns, schema=schema), town.shard.path("street_maps"))
+    storage.write_parquet(pa.table(columns, schema=schema), shard.path("street_maps"))
     return len(rows)
 
 

@@ -77,7 +77,7 @@ def test_distances_agree_with_shapely():
     assert np.abs(found - truth.clip(-REACH_M, REACH_M)).max() < AREA.resolution_m
 
 
-def test_areas_with_and_without_streets_have_the_largest_distances():
+def test_areas_without_borders_have_the_largest_distances():
     full = np.ones((64, 64), bool)
     assert (measure_street_distances(full, ~full, 0.5) == np.array([REACH_M, -REACH_M])[:, None, None]).all()
     with pytest.raises(ValueError, match=r"masks of \(60, 64\) pixels of 0.5 m cannot be divided"):

@@ -22,11 +22,12 @@ import pytest
 from helpers import ROOT, random_scene
 
 from models.layout import LayoutSpec
-from models.scene import CATEGORIES, UNSET, VEGETATION, VEHICLES, Scene, make_yaw_rotation
+from models.scene import CATEGORIES, UNSET, VEGETATION, VEHICLES, Grid, Scene, make_yaw_rotation
 from pipelines.editing.edit import Remove, Select
 from pipelines.generation.batch_edit import EditRequest, edit_shard
 from pipelines.preprocess.sources import argoverse2, kitti360
 from pipelines.preprocess.sources.town.generator import generate_town
+from pipelines.preprocess.street_maps import write_street_maps
 from pipelines.runtime import storage
 from pipelines.schema.density_labels import classify_density, compute_density_thresholds
 from pipelines.schema.tables import (
@@ -186,6 +187,11 @@ def root(town, generated_scenes, rejects, tmp_path_factory) -> Path:
     moments = pa.FixedShapeTensorArray.from_numpy_ndarray(np.zeros((len(shard.scenes()), 4, 8, 8), np.float16))
     ids = shard.read("scenes", ["scene_id"])["scene_id"].combine_chunks()
     storage.write_parquet(pa.table([ids, moments, moments], schema=SCHEMAS["latents"]), shard.path("latents"))
+    grounds, cells = (np.zeros((len(ids), *shape)) for shape in ((2, 8, 8), (8, 8)))
+    tensors = map(pa.FixedShapeTensorArray.from_numpy_ndarray, (grounds.astype(np.float16), cells.astype(np.uint8)))
+    streets = pa.table([ids, *tensors], schema=SCHEMAS["street_latents"])
+    storage.write_parquet(streets, shard.path("street_latents"))
+    write_street_maps([random_scene(0, grid=Grid(256.0, 128.0, 0.5, 512, 512))], shard)
     return path
 
 
