@@ -43,6 +43,7 @@ from helpers import (
     REJECT_REASON,
     SHARD_SIZES,
     TOWN_SLOTS,
+    fit_here,
     random_scene,
     small_spec,
     studio_scene,
@@ -181,23 +182,9 @@ def smoke(tmp_path_factory, cluster) -> Path:
     """A $PRITTI_HOME with the same content as `home`, but this process trains the models without Ray Train."""
     path = tmp_path_factory.mktemp("smoke")
     os.environ["PRITTI_HOME"] = str(path)
-    import torch
-
     import jobs.support.trainer
     from jobs.implementation.train_dit import train
-    from jobs.support.trainer import convert_to_tensors
     from jobs.train_dit import Config
-    from pipelines.training.data_loader import iterate_batches
-
-    def fit_here(run, num_workers: int, output: str, min_workers: int) -> str:
-        trainer = run.build(torch.device("cpu"), lambda model: model)
-        for batch in iterate_batches(run.stream, run.reader, 0, run.settings.steps):
-            trainer.step(convert_to_tensors(batch), range(run.stream.batch_size))
-        model = trainer.ema_model()
-        jobs.support.trainer.tag_weights(run.tracker, model, trainer.steps_done)
-        model.save_pretrained(output)
-        run.tracker.finish("FINISHED")
-        return output
 
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(jobs.support.trainer, "fit", fit_here)

@@ -101,6 +101,21 @@ def tiny_planner(size: int = 32) -> StreetPlanner:
     return made.eval().requires_grad_(False)
 
 
+def fit_here(run, num_workers: int, output: str, min_workers: int | None) -> str:
+    """Train in this process instead of with Ray Train (`jobs.support.trainer.fit`)."""
+    from jobs.support.trainer import convert_to_tensors, tag_weights
+    from pipelines.training.data_loader import iterate_batches
+
+    trainer = run.build(torch.device("cpu"), lambda model: model)
+    for batch in iterate_batches(run.stream, run.reader, 0, run.settings.steps):
+        trainer.step(convert_to_tensors(batch), range(run.stream.batch_size))
+    model = trainer.ema_model()
+    tag_weights(run.tracker, model, trainer.steps_done)
+    model.save_pretrained(output)
+    run.tracker.finish("FINISHED")
+    return output
+
+
 def scenes_equal(a, b) -> bool:
     """Return True if two scenes are equal in all fields that decoders predict."""
     names = ("category", "center_m", "size_m", "rotation", "height_m", "occupied")

@@ -11,14 +11,17 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
-from helpers import run_command, small_spec
+from helpers import fit_here, run_command, small_spec
 from safetensors.torch import load_file
 
 from models.dit import DiT
 from models.presets import LVAE_PRESETS
 from models.training import OptimizerConfig, make_dit_trainer
+from pipelines.preprocess.street_maps import compute_map_thresholds
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import find_shards
+from pipelines.training.latents import digest_weights
+from pipelines.training.street_map_reader import StreetMapReader
 
 
 def load_weights(directory: Path) -> dict:
@@ -97,6 +100,36 @@ def test_encode_writes_the_latents_of_streets(home, tmp_path):
     for cells, (scene, paved) in zip(arrays["street_cells"], kept, strict=True):
         side = scene.grid.rows // size
         assert np.array_equal(cells, paved.reshape(size, side, size, side).all(axis=(1, 3)))
+
+
+def test_street_planner_joins_a_pipeline(home, tmp_path, monkeypatch):
+    import jobs.support.trainer
+    from jobs.implementation.train_street_planner import train
+    from jobs.train_street_planner import Config
+    from models.labels import LABELS
+    from models.pipeline import PrITTIPipeline
+
+    monkeypatch.setattr(jobs.support.trainer, "fit", fit_here)
+    model = str(home / "models/pritti-smoke")
+    config = Config("smoke", model=model, dataset=str(tmp_path / "maps"), output=str(tmp_path / "made"), num_maps=3)
+    assert train(config) == config.output
+    pipeline = PrITTIPipeline.from_pretrained(config.output)
+    assert pipeline.plans_streets and pipeline.street_planner.config.size == 64
+    assert digest_weights(pipeline.dit) == digest_weights(PrITTIPipeline.from_pretrained(model).dit)
+    shards = find_shards(config.dataset, "street_maps")
+    assert [(shard.split, shard.read("street_maps").num_rows) for shard in shards] == [("test", 4), ("train", 3)]
+    reader = StreetMapReader(tuple(compute_map_thresholds(shards[1:]).items()), seed=0)
+    arrays = reader(shards[1], np.arange(3), np.arange(3))
+    assert arrays["mean"].shape == (3, 2, 64, 64) and all(
+        LABELS["partial"][k].endswith("-free") for k in arrays["label"].tolist()
+    )
+    # The distances of maps are normalised.
+    plain = replace(reader, seed=None)(shards[1], np.arange(3))["mean"].astype(float)
+    assert np.allclose(plain.mean((0, 2, 3)), pipeline.street_planner.config.shift)
+    with pytest.raises(ValueError, match="this pipeline has no street planner; omit the option"):
+        train(replace(config, name="again", start_from=model))
+    with pytest.raises(ValueError, match="--num-maps is 0, expected 1 or more"):
+        train(replace(config, name="again", num_maps=0))
 
 
 def test_train_logs_run_and_model_to_mlflow(home):
