@@ -64,6 +64,8 @@ def publish(config: Config) -> list[str]:
     ]
     for *_, last in stages:
         require_data(last, about, facts, directory)
+    if pipeline.street_planner is not None:
+        stages.append(read_history("pritti-streets", "Street planner", pipeline.street_planner))
     trainings = [training for stage in stages for training in stage]
     output = resolve_path(config.output, "zoo", config.name)
     entry = {"trainings": trainings, "facts": facts, "scores": scores, "about": about}
