@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import ray
 import torch
-from PIL import Image
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from models.composition.block_grid import RANKS, BlockGrid, BlockIndex, choose_arrangement, label_blocks, rank_outward
+from models.composition.block_grid import RANKS, BlockGrid, BlockIndex, choose_arrangement, label_blocks
 from models.composition.outpaint import (
     BlockComposer,
     SceneBlock,
@@ -34,7 +31,7 @@ from models.composition.street_plan import StreetPlan
 from models.execution import SamplingExecution
 from models.pipeline import PrITTIPipeline
 from models.sampling.repaint import InpaintingConfig
-from models.scene import UNSET, Grid, Scene
+from models.scene import UNSET, Scene
 from models.tensors import make_empty_scene
 from pipelines.generation.sample import (
     Request,
@@ -42,6 +39,16 @@ from pipelines.generation.sample import (
     guard_generation_run,
     load_pipeline,
     resample_to_model_grid,
+)
+from pipelines.generation.street_plans import (
+    Part,
+    Section,
+    SectionTask,
+    draw_plan,
+    list_sections,
+    make_section_path,
+    read_section,
+    write_section,
 )
 from pipelines.io.mesh_export import export_glb
 from pipelines.io.tileset import TileContent, find_tile_bounds, make_tileset
@@ -51,7 +58,6 @@ from pipelines.runtime.resources import make_model_resources, require_room
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, find_unwritten, require_written
 
-PLAN_PIXEL_M = 1.0  # Side of a pixel of the picture of a street plan.
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")
 MAX_RETRIES = 3  # Number of retries for a block whose process died.
 
@@ -138,37 +144,6 @@ class OutpaintRequest(Request):
         )
 
 
-@dataclass(frozen=True, order=True)
-class Section:
-    """A section of the street plan of a scene.
-
-    Attributes:
-        ahead: Number of steps ahead of the first section.
-        left: Number of steps to its left.
-    """
-
-    ahead: int
-    left: int
-
-
-Part = BlockIndex | Section  # What a task of a scene makes or needs.
-
-
-@dataclass(frozen=True)
-class SectionTask:
-    """A section of a street plan to generate.
-
-    Attributes:
-        number: Number of the scene in the run.
-        section: The section.
-        needs: Sections that this section continues.
-    """
-
-    number: int
-    section: Section
-    needs: frozenset[Part]
-
-
 @dataclass(frozen=True)
 class BlockBatch:
     """Blocks of a scene that are generated in one batch.
@@ -228,27 +203,6 @@ def list_batches(
     return listed
 
 
-def list_sections(plan: StreetPlan, wanted: Iterable[Section], number: int) -> list[SectionTask]:
-    """List sections of a street plan and their predecessors, in an order that respects dependencies.
-
-    Args:
-        plan: Street plan.
-        wanted: Sections that are needed.
-        number: Number of the scene in the run.
-
-    Returns:
-        Sections.
-    """
-    needs: dict[BlockIndex, list[BlockIndex]] = {}
-    waiting = [(section.ahead, section.left) for section in wanted]
-    while waiting:
-        if (index := waiting.pop()) not in needs:
-            needs[index] = plan.list_predecessors(index)
-            waiting += needs[index]
-    ordered = sorted(needs, key=lambda index: (rank_outward(index), index))
-    return [SectionTask(number, Section(*index), frozenset(Section(*one) for one in needs[index])) for index in ordered]
-
-
 # ------------------------------------------------------------------------------------------------------------ blocks
 
 
@@ -263,37 +217,6 @@ def make_block_path(directory: str, index: BlockIndex) -> str:
         Path of a .safetensors file.
     """
     return storage.join_uri(directory, f"{index[0]:+05d}{index[1]:+05d}.safetensors")
-
-
-def make_section_path(directory: str, section: Section) -> str:
-    """Return the path of the file of a section of a street plan.
-
-    Args:
-        directory: Directory of the blocks of the scene.
-        section: The section.
-
-    Returns:
-        Path of a .safetensors file.
-    """
-    return storage.join_uri(directory, f"streets{section.ahead:+05d}{section.left:+05d}.safetensors")
-
-
-def read_section(path: str) -> np.ndarray:
-    """Read the distances of a section of a street plan.
-
-    Args:
-        path: Path of the .safetensors file.
-
-    Returns:
-        (2, size, size) distances (m).
-
-    Raises:
-        ValueError: The file is damaged. The message names the file.
-    """
-    try:
-        return load(storage.read_bytes(path))["distance_m"].numpy()
-    except (SafetensorError, KeyError) as error:
-        raise ValueError(f"{path}: no complete street plan ({error}); delete the file and run the job again") from error
 
 
 def write_block(block: SceneBlock, path: str) -> None:
@@ -382,9 +305,8 @@ class Outpainter:
         """
         plan = self.load_plan(task.number, (one for one in task.needs if isinstance(one, Section)))
         distance_m = plan.get_section((task.section.ahead, task.section.left))
-        data = save({"distance_m": torch.from_numpy(distance_m.copy())})
         path = make_section_path(self.request.blocks_directory(task.number), task.section)
-        storage.write_whole(path, lambda stream: stream.write(data))
+        write_section(distance_m, path)
 
     def load_scene(self, number: int) -> Scene:
         """Return an input scene, resampled to the grid of the model.
@@ -571,28 +493,6 @@ def make_plan(pipeline: PrITTIPipeline, request: OutpaintRequest, given: Scene, 
     step_m = BlockComposer(block_grid, pipeline.spec, pipeline.encode).step_m
     label_at = make_label_finder(labels, step_m, given.grid)
     return pipeline.plan_streets(given, label_at, request.seed, number, list_sketches(request.roads))
-
-
-def draw_plan(plan: StreetPlan, whole: Grid, first: Grid) -> bytes:
-    """Draw a street plan as a map that `--road-sketch` accepts: white roads, grey sidewalks, black elsewhere.
-
-    Args:
-        plan: Street plan.
-        whole: Grid of the city.
-        first: Grid of the given scene, whose middle is the middle of the picture.
-
-    Returns:
-        PNG file with pixels of PLAN_PIXEL_M. It covers the city and is black outside.
-    """
-    ahead_m, left_m = (first.front_m + first.back_m) / 2, (first.left_m + first.right_m) / 2
-    reach = max(whole.front_m - ahead_m, ahead_m - whole.back_m), max(whole.left_m - left_m, left_m - whole.right_m)
-    rows, cols = (2 * round(one / PLAN_PIXEL_M) for one in reach)
-    grid = Grid(ahead_m + rows / 2 * PLAN_PIXEL_M, left_m + cols / 2 * PLAN_PIXEL_M, PLAN_PIXEL_M, rows, cols)
-    inside = whole.contains(grid.x_m()[:, None], grid.y_m()[None, :])
-    road, paved = (mask & inside for mask in plan.collect(whole).draw(grid))
-    stream = io.BytesIO()
-    Image.fromarray(np.where(road, 255, np.where(paved, 128, 0)).astype(np.uint8)).save(stream, "png")
-    return stream.getvalue()
 
 
 def make_plan_path(request: OutpaintRequest, number: int) -> str:
