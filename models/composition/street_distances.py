@@ -17,6 +17,7 @@ from models.scene import Grid, Scene
 
 PIXEL_M = 4.0  # Side of a pixel of a street plan.
 REACH_M = 8.0  # Distances are clipped to this length.
+GAP_M = 12.0  # Gaps of up to this length between roads are closed when streets are drawn.
 SCENE_M = 64.0  # Side of the scenes that street plans continue.
 
 
@@ -83,7 +84,9 @@ class StreetDistances:
     distance_m: np.ndarray
 
     def draw(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-        """Draw the roads on a grid.
+        """Draw the roads on a grid, and close gaps between roads.
+
+        Thin roads of generated plans have gaps. The mask of the roads is closed by a disc (morphological closing).
 
         Args:
             grid: Grid in the frame of block (0, 0).
@@ -92,10 +95,21 @@ class StreetDistances:
             Masks (rows, cols) of the pixels of roads, and of roads and sidewalks. Outside of the rectangle, the nearest
             distances apply.
         """
-        row, col = (self.front_m - grid.x_m()) / PIXEL_M - 0.5, (self.left_m - grid.y_m()) / PIXEL_M - 0.5
+        width = int(GAP_M / grid.resolution_m) + 1  # A pixel depends on others up to GAP_M away.
+        margin_m = width * grid.resolution_m
+        wide = Grid(
+            grid.front_m + margin_m,
+            grid.left_m + margin_m,
+            grid.resolution_m,
+            grid.rows + 2 * width,
+            grid.cols + 2 * width,
+        )
+        row, col = (self.front_m - wide.x_m()) / PIXEL_M - 0.5, (self.left_m - wide.y_m()) / PIXEL_M - 0.5
         at = np.meshgrid(row, col, indexing="ij")
         road, paved = (map_coordinates(part, at, order=1, mode="nearest") >= 0 for part in self.distance_m)
-        return road, road | paved
+        road |= _close(road, GAP_M / 2 / grid.resolution_m)
+        inner = slice(width, -width)
+        return road[inner, inner], (road | paved)[inner, inner]
 
     def find_contradiction(self, scene: Scene) -> tuple[float, float, str] | None:
         """Find given ground of another class inside of the roads.
@@ -107,6 +121,14 @@ class StreetDistances:
             x and y of such a point (m), and the class of the ground; None if there is no such ground.
         """
         return find_deep_contradiction(self.draw(scene.grid)[0], scene)
+
+
+def _close(mask: np.ndarray, radius_px: float) -> np.ndarray:
+    """Return the morphological closing of a mask by a disc. Values near the border of the mask are not exact."""
+    if not mask.any():
+        return mask
+    grown = np.asarray(distance_transform_edt(~mask)) <= radius_px
+    return np.asarray(distance_transform_edt(grown)) > radius_px if not grown.all() else grown
 
 
 def read_street_masks(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

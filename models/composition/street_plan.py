@@ -20,6 +20,7 @@ from torch import Tensor
 from models.composition.block_grid import BlockGrid, BlockIndex, rank_outward
 from models.composition.road_sketch import SketchedRoad, draw_roads
 from models.composition.street_distances import (
+    GAP_M,
     PIXEL_M,
     REACH_M,
     StreetDistances,
@@ -128,8 +129,9 @@ class StreetPlan:
 
     def _cover(self, grid: Grid) -> Grid:
         """Return the grid of all pixels of the plan that are needed to draw the streets on a grid."""
-        back, right = (int(low_m // PIXEL_M) - 1 for low_m in (grid.back_m, grid.right_m))
-        front, left = (int(-(-high_m // PIXEL_M)) + 1 for high_m in (grid.front_m, grid.left_m))
+        margin = int(np.ceil(GAP_M / PIXEL_M)) + 1
+        back, right = (int(low_m // PIXEL_M) - margin for low_m in (grid.back_m, grid.right_m))
+        front, left = (int(-(-high_m // PIXEL_M)) + margin for high_m in (grid.front_m, grid.left_m))
         return Grid(front * PIXEL_M, left * PIXEL_M, PIXEL_M, front - back, left - right)
 
     def _owns(self, index: BlockIndex) -> np.ndarray:

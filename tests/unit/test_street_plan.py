@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import QUICK, random_scene, scenes_equal, small_spec, tiny_pipeline, tiny_planner
+from scipy.ndimage import label
 
 from models.composition.infinite import InfiniteScene
 from models.composition.outpaint import uses_street_plan
@@ -87,6 +88,19 @@ def test_areas_without_borders_have_the_largest_distances():
         measure_street_distances(full, full, 3.0)
 
 
+def test_gaps_between_roads_are_closed():
+    main, broken = SketchedRoad(((-300.0, 40.0), (300.0, 40.0))), SketchedRoad(((0.0, 44.0), (0.0, -300.0)))
+    road, sidewalk = draw_roads([main, broken], AREA)
+    for first_m, is_closed in ((-6.0, True), (-24.0, False)):
+        gap = (AREA.y_m() < 0) & (AREA.y_m() > first_m)
+        masks = road & ~gap, (road | sidewalk) & ~gap
+        distance_m = measure_street_distances(*masks, AREA.resolution_m)
+        drawn, paved = StreetDistances(AREA.front_m, AREA.left_m, distance_m).draw(AREA)
+        assert (label(drawn)[1] == 1) == is_closed and label(masks[0])[1] == 2
+        away = np.abs(AREA.y_m() - first_m / 2) > 20
+        assert (drawn != road)[:, away].mean() < 0.002 and (paved | ~drawn).all()
+
+
 def test_map_of_a_town_shows_its_streets():
     scene = next(make_large_crops(7, 1, AREA))
     row = make_row(scene)
@@ -141,7 +155,7 @@ def test_plan_continues_the_given_scene():
     plan = StreetPlan(tiny_planner(), street, **FEW)
     assert plan.section_m == 128.0
     road, paved = plan.draw(street.grid)
-    inner = slice(4, -4)
+    inner = slice(8, -8)  # Nearer to the border, gaps to other roads may be closed.
     assert np.array_equal(road[inner, inner], read_street_masks(street)[0][inner, inner])
     assert np.array_equal(paved[inner, inner], read_street_masks(street)[1][inner, inner])
     assert plan.find_contradiction(street) is None
