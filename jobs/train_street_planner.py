@@ -63,7 +63,7 @@ class Config:
     round_weights: bool = False
     """Round the weights of the result to float16, so its files need half the space."""
     seed: int = 0
-    """Random seed of the training and of the street maps."""
+    """Random seed of the training. The street maps do not depend on it."""
 
 
 if __name__ == "__main__":

@@ -32,6 +32,28 @@ class DiffusionModel(ConfiguredModel):
     noise_shares: Tensor
 
     @property
+    def latent_shape(self) -> tuple[int, int, int]:
+        """Shape (c, h, w) of a latent."""
+        raise NotImplementedError
+
+    @property
+    def num_mask_uniform(self) -> int:
+        """Number of random numbers per sample of `make_known_masks`; 0 if the network reads no known part."""
+        raise NotImplementedError
+
+    def make_known_masks(self, uniform: Tensor, values: Tensor) -> Tensor:
+        """Make masks of random known parts for the training.
+
+        Args:
+            uniform: (b, num_mask_uniform) random numbers between 0 and 1.
+            values: (b, c, h, w) clean latents before normalisation.
+
+        Returns:
+            Masks with the shape of `values`; 1 marks values to generate, 0 marks known values.
+        """
+        raise NotImplementedError
+
+    @property
     def diffusion(self) -> Diffusion:
         """Noise schedule of the training."""
         return Diffusion(**self.config.schedule)

@@ -25,6 +25,7 @@ from models.layout import LayoutSpec
 from models.limits import require_within
 from models.options import FINITE, LARGE, Choice, Flag, Integer, Number, Rule, Sequential, check_entries
 from models.sampling.diffusion import PAPER_SCHEDULE, Denoiser, Diffusion
+from models.sampling.known_regions import NUM_UNIFORM, make_training_masks
 
 FREQUENCIES = 256
 Prediction = Literal["epsilon", "v_prediction"]
@@ -258,6 +259,28 @@ class DiT(DiffusionModel):
     def list_modulations(self) -> list[nn.Linear]:
         """Return the layers that map the condition to modulations: one layer per block, then the output layer."""
         return [*(cast(DiTBlock, block).modulation for block in self.blocks), self.modulation]
+
+    @property
+    def latent_shape(self) -> tuple[int, int, int]:
+        """Shape (c, h, w) of a latent."""
+        return self.config.channels, self.config.size, self.config.size
+
+    @property
+    def num_mask_uniform(self) -> int:
+        """Number of random numbers per sample of `make_known_masks`; 0 without `inpainting`."""
+        return NUM_UNIFORM if self.config.inpainting else 0
+
+    def make_known_masks(self, uniform: Tensor, values: Tensor) -> Tensor:
+        """Make masks of random known parts for the training (`models.sampling.known_regions.make_training_masks`).
+
+        Args:
+            uniform: (b, num_mask_uniform) random numbers between 0 and 1.
+            values: (b, c, h, w) clean latents; they do not matter.
+
+        Returns:
+            Masks with the shape of `values`; 1 marks values to generate, 0 marks known values.
+        """
+        return make_training_masks(uniform, self.config.channels, self.config.size)
 
     def condition(self, timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]) -> Float[Tensor, "batch d"]:
         """Compute the condition that modulates every block: SiLU(timestep embedding + label embedding).

@@ -11,8 +11,8 @@ from models.composition.block_grid import BlockIndex, choose_arrangement, label_
 from models.composition.extend import Side, extend_scene
 from models.composition.generator import StepCallback
 from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
-from models.composition.outpaint import outpaint_scene, uses_street_plan
-from models.composition.road_sketch import RoadMap, SketchedRoad, Streets
+from models.composition.outpaint import count_planned_cells, outpaint_scene, uses_street_plan
+from models.composition.road_sketch import SketchedRoad, Streets
 from models.composition.street_plan import StreetPlan, convert_label
 from models.sampling.diffusion import INPAINT, InpaintCondition, SceneKey
 from models.sampling.repaint import InpaintingConfig
@@ -157,8 +157,7 @@ class PrITTIPipeline(SamplingPipeline):
         self.require_grid(scene)
         mode = str(mode or self.config.neighbour_latents)
         has_plan = uses_street_plan(self, roads, mode, max(num_blocks) > 1, plan_streets)
-        is_planned = has_plan or any(isinstance(one, RoadMap) for one in roads)
-        cells = self.latent_shape[-1] * is_planned
+        cells = count_planned_cells(self, roads, has_plan)
         arrangement = choose_arrangement(num_blocks, order, overlap, free_blocks, margin, cells)
         if isinstance(label, str):
             label = label_blocks(self.dit.config.label, label, num_blocks, arrangement.free_blocks)

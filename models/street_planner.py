@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
@@ -20,7 +21,10 @@ from models.labels import LABELS
 from models.limits import require_within
 from models.options import FINITE, LARGE, Choice, Integer, Number, Rule, Sequential, check_entries
 from models.sampling.diffusion import PAPER_SCHEDULE, Denoiser, Diffusion
+from models.sampling.known_regions import NUM_STREET_UNIFORM, make_street_masks
 
+PIXEL_M = 4.0  # Side of a pixel of a street plan.
+SCENE_M = 64.0  # Side of the scenes that street plans continue.
 CHANNELS = 2  # Distance to the border of the roads, and to the border of the paved area.
 LABEL_KIND = "partial"  # Kind of label: densities of vegetation and vehicles, or any.
 MAX_LEVELS = 8
@@ -36,6 +40,20 @@ RULES: dict[str, Rule] = {
     "scale": Sequential(Number(1e-6, LARGE), CHANNELS, CHANNELS),
     "prediction": Choice(("v_prediction",)),
 }
+
+
+def measure_border_distances(rows: int, cols: int) -> np.ndarray:
+    """Return the distance of the pixels of a street plan to the border of the plan.
+
+    Args:
+        rows: Number of rows.
+        cols: Number of columns.
+
+    Returns:
+        (rows, cols) distances of the centres (m).
+    """
+    row, col = ((0.5 + np.minimum(np.arange(n), np.arange(n)[::-1])) * PIXEL_M for n in (rows, cols))
+    return np.minimum(row[:, None], col[None, :])
 
 
 class StreetPlanner(DiffusionModel):
@@ -56,6 +74,8 @@ class StreetPlanner(DiffusionModel):
     Raises:
         ValueError: `block_px` does not divide `size`, or the size is too small for the number of levels.
     """
+
+    border_m: Tensor
 
     @register_to_config
     def __init__(
@@ -92,12 +112,40 @@ class StreetPlanner(DiffusionModel):
             norm_num_groups=GROUPS,
             num_class_embeds=num_labels + 1,
         )
-        self._schedule, self._block_px = schedule, block_px
+        self._schedule, self._block_px, self._size = schedule, block_px, size
         register_computed_buffers(self)
 
     def compute_buffers(self) -> dict[str, Tensor]:
-        """Return per timestep the weights of the latent and of v in the noise."""
-        return {"noise_shares": make_noise_shares(self._schedule)}
+        """Return per timestep the weights of the latent and of v in the noise, and the distances (size, size) of the
+        pixels of a scene in the middle to its border, 0 outside (m).
+        """
+        size, side = self._size, min(round(SCENE_M / PIXEL_M), self._size)
+        border_m = torch.zeros(size, size)
+        inside = slice((size - side) // 2, (size + side) // 2)
+        border_m[inside, inside] = torch.from_numpy(measure_border_distances(side, side)).float()
+        return {"noise_shares": make_noise_shares(self._schedule), "border_m": border_m}
+
+    @property
+    def latent_shape(self) -> tuple[int, int, int]:
+        """Shape of a street plan."""
+        return CHANNELS, self._size, self._size
+
+    @property
+    def num_mask_uniform(self) -> int:
+        """Number of random numbers per sample of `make_known_masks`."""
+        return NUM_STREET_UNIFORM
+
+    def make_known_masks(self, uniform: Tensor, values: Tensor) -> Tensor:
+        """Make masks of random known parts for the training (`models.sampling.known_regions.make_street_masks`).
+
+        Args:
+            uniform: (b, num_mask_uniform) random numbers between 0 and 1.
+            values: (b, 2, size, size) distances (m).
+
+        Returns:
+            Masks with the shape of `values`; 1 marks values to generate, 0 marks known values.
+        """
+        return make_street_masks(uniform, values, self.border_m)
 
     @classmethod
     def parse_config(cls, config: dict[str, Any]) -> dict[str, Any]:

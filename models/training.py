@@ -26,7 +26,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from models.base import ConfiguredModel
 from models.batch import LayoutBatch
-from models.composition.street_distances import PIXEL_M, SCENE_M, measure_border_distances
 from models.diffusion_model import DiffusionModel
 from models.dit import DiT
 from models.execution import require_bf16
@@ -41,13 +40,6 @@ from models.sampling.diffusion import (
     make_keyed_generator,
     start_drawing,
 )
-from models.sampling.known_regions import (
-    NUM_STREET_UNIFORM,
-    NUM_UNIFORM,
-    make_street_masks,
-    make_training_masks,
-)
-from models.street_planner import CHANNELS, StreetPlanner
 from models.vae.losses import compute_lvae_loss
 from models.vae.matching import NonFiniteCostError
 
@@ -381,7 +373,7 @@ class DiffusionLossConfig:
 
 
 def make_diffusion_loss(
-    dit: DiT | StreetPlanner, label_dropout: float, config: DiffusionLossConfig | None = None
+    dit: DiffusionModel, label_dropout: float, config: DiffusionLossConfig | None = None
 ) -> LossFunction:
     """Return the loss function of stage 2 (training of the DiT): mean squared error of the noise (Eq. "LDM").
 
@@ -395,24 +387,17 @@ def make_diffusion_loss(
 
     Returns:
         A function that computes the losses from a batch of posteriors (`mean`, `logvar`) and labels (`label`). An
-        inpainting model receives random known parts (`make_training_masks`, `make_street_masks`), which have no error.
+        inpainting model receives random known parts (`DiffusionModel.make_known_masks`), which have no error.
     """
     config = config or DiffusionLossConfig()
     diffusion = dit.diffusion
-    is_planner = isinstance(dit, StreetPlanner)
-    shape = (CHANNELS if is_planner else dit.config.channels, dit.config.size, dit.config.size)
+    shape = dit.latent_shape
     shift = torch.tensor(dit.config.shift or [0.0] * shape[0], device=dit.device)[:, None, None]
     scale = torch.tensor(dit.config.scale or [1.0] * shape[0], device=dit.device)[:, None, None]
     parts = list_dropped_labels(dit.config.label)
     remaining = None if parts is None else torch.tensor(parts, device=dit.device)
-    inpainting = is_planner or dit.config.inpainting
-    border_m = torch.zeros(shape[1:], device=dit.device)
-    if is_planner:
-        side = round(SCENE_M / PIXEL_M)
-        inside = slice((shape[1] - side) // 2, (shape[1] + side) // 2)
-        border_m[inside, inside] = torch.from_numpy(measure_border_distances(side, side)).float()
-    share = config.known_streets_share if inpainting and not is_planner else 0.0
-    num_mask = 0 if not inpainting else NUM_STREET_UNIFORM if is_planner else NUM_UNIFORM
+    num_mask = dit.num_mask_uniform
+    share = config.known_streets_share if num_mask else 0.0
 
     def loss(
         model: Callable[..., Any], arrays: dict[str, Tensor], generators: list[torch.Generator]
@@ -425,12 +410,8 @@ def make_diffusion_loss(
         uniform = sample_uniform(generators, count + num_mask + (share > 0), device)
         drawn = mean + (0.5 * arrays["logvar"].float()).exp() * posterior_noise[0] if posterior_noise else mean
         latent = (drawn - shift) / scale
-        if inpainting:
-            mask = (
-                make_street_masks(uniform[:, count:], mean, border_m)
-                if is_planner
-                else make_training_masks(uniform[:, count : count + num_mask], shape[0], shape[1])
-            )
+        if num_mask:
+            mask = dit.make_known_masks(uniform[:, count : count + num_mask], mean)
         if share:
             half = shape[0] // 2
             streets = (arrays["street_ground"].float() - shift[:half]) / scale[:half]
@@ -444,10 +425,10 @@ def make_diffusion_loss(
             label = remaining[label, dropped[:, 0] + 2 * dropped[:, 1]]
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
         noisy = diffusion.add_noise(latent, noise, timestep)
-        if inpainting:
+        if num_mask:
             noisy = join_known(noisy, InpaintCondition(latent, mask))
         error = F.mse_loss(model(noisy, timestep, label).float(), noise, reduction="none")
-        error = (error * mask if inpainting else error).flatten(1).mean(1)
+        error = (error * mask if num_mask else error).flatten(1).mean(1)
         weight = compute_loss_weight(dit, timestep, config.loss_weighting)
         return {"loss": (weight * error).mean(), "noise_error": error.mean()}
 
@@ -694,7 +675,7 @@ def make_lvae_trainer(
 
 
 def make_dit_trainer(
-    model: DiT | StreetPlanner,
+    model: DiffusionModel,
     settings: OptimizerConfig,
     label_dropout: float,
     device: torch.device,

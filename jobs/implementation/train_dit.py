@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,7 +25,7 @@ from jobs.support import trainer
 from jobs.support.callbacks import SamplingCheck
 from jobs.support.cli import home_path, make_absolute, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
-from jobs.support.model_files import publish_directory
+from jobs.support.model_files import write_pipeline
 from jobs.support.outputs import hold_training
 from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun
@@ -347,9 +346,7 @@ def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
     """
     dit = DiT.from_pretrained(storage.join_uri(output, "dit"))
     pipeline = PrITTIPipeline(load_lvae(lvae), dit, **sampling)
-    with tempfile.TemporaryDirectory() as directory:
-        pipeline.save_pretrained(directory)
-        publish_directory(directory, output)
+    write_pipeline(pipeline, output)
     return output
 
 

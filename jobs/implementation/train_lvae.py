@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, is_dataclass, replace
 from functools import partial
@@ -18,7 +17,7 @@ from jobs.support import trainer
 from jobs.support.callbacks import ReconstructionCheck
 from jobs.support.cli import home_path, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
-from jobs.support.model_files import publish_directory
+from jobs.support.model_files import write_pipeline
 from jobs.support.outputs import hold_training
 from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun, convert_to_tensors
@@ -293,9 +292,7 @@ def write_updated_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
         )
     pipeline.register_modules(lvae=load_lvae(lvae))
     output = home_path("models", f"pritti-{training.name}")
-    with tempfile.TemporaryDirectory() as directory:
-        pipeline.save_pretrained(directory)
-        publish_directory(directory, output)
+    write_pipeline(pipeline, output)
     return output
 
 

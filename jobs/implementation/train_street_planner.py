@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import replace
 from functools import partial
 
@@ -14,7 +13,7 @@ from jobs.support import trainer
 from jobs.support.callbacks import StreetPlanCheck
 from jobs.support.cli import home_path, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
-from jobs.support.model_files import publish_directory
+from jobs.support.model_files import write_pipeline
 from jobs.support.outputs import hold_output, hold_training
 from jobs.support.progress import JobProgress
 from jobs.support.ray_session import start_ray
@@ -108,7 +107,7 @@ def resolve_preset(config: Config) -> StreetPlannerPreset:
 
 def make_maps(config: Config, row: StreetPlannerPreset, root: str) -> tuple[list[Shard], list[Shard]]:
     """Make the street maps that are missing, and return the shards of the training and of the test split."""
-    plan = plan_street_maps(root, row.num_maps, row.num_test_maps, config.seed)
+    plan = plan_street_maps(root, row.num_maps, row.num_test_maps)
     with hold_output(root, "street maps", config), JobProgress() as bar:
         start_ray(training=True)
         shown = bar.add_task("make street maps", total=sum(town.count for town in plan))
@@ -189,9 +188,7 @@ def complete_pipeline(model: str, output: str) -> str:
     """
     pipeline = load_pipeline(model)
     pipeline.register_modules(street_planner=StreetPlanner.from_pretrained(storage.join_uri(output, "street_planner")))
-    with tempfile.TemporaryDirectory() as directory:
-        pipeline.save_pretrained(directory)
-        publish_directory(directory, output)
+    write_pipeline(pipeline, output)
     return output
 
 

@@ -4,8 +4,28 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
+from typing import TYPE_CHECKING
 
 from pipelines.runtime import storage
+
+if TYPE_CHECKING:
+    from models.pipeline import PrITTIPipeline
+
+
+def write_pipeline(pipeline: PrITTIPipeline, output: str) -> None:
+    """Write a pipeline to a directory or URI.
+
+    Args:
+        pipeline: Pipeline.
+        output: Target directory or URI.
+
+    Raises:
+        ValueError: A file is not in the output, or has another size there.
+    """
+    with tempfile.TemporaryDirectory() as directory:
+        pipeline.save_pretrained(directory)
+        publish_directory(directory, output)
 
 
 def publish_directory(directory: str, output: str) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 from torch import Tensor
 
 from models.composition.inpaint import Contents
-from models.composition.road_sketch import SketchedRoad, Streets
+from models.composition.road_sketch import SketchedRoad
+from models.composition.street_plan import StreetPlan
 from models.layout import LayoutSpec
 from models.sampling.diffusion import InpaintCondition, SceneKey
 from models.sampling.repaint import InpaintingConfig
@@ -50,7 +51,7 @@ class SceneGenerator(Protocol):
         seed: int = 0,
         index: int = 0,
         sketches: Sequence[SketchedRoad] = (),
-    ) -> Streets:
+    ) -> StreetPlan:
         """Plan the streets around a scene (see `PrITTIPipeline.plan_streets`).
 
         Args:

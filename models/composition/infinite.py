@@ -12,13 +12,13 @@ from models.composition.outpaint import (
     BlockComposer,
     SceneBlock,
     check_roads,
+    count_planned_cells,
     find_ground_height,
     generate_blocks,
-    list_sketches,
-    make_label_finder,
+    make_street_plan,
     uses_street_plan,
 )
-from models.composition.road_sketch import RoadMap, Streets
+from models.composition.road_sketch import Streets
 from models.sampling.repaint import InpaintingConfig
 from models.scene import Grid, Scene
 
@@ -73,9 +73,9 @@ class InfiniteScene:
         self.model, self.label, self.seed, self.scene_index = model, label, seed, scene_index
         self.options: dict[str, Any] = {"mode": mode, "repaint": repaint, "guidance_scale": guidance_scale}
         self.plans_streets = uses_street_plan(model, roads, mode, True, plan_streets)
-        has_plan = self.plans_streets or any(isinstance(one, RoadMap) for one in roads)
         size = model.latent_shape[-1]
-        margin = choose_arrangement((2, 2, 2, 2), order, overlap, None, margin, size * has_plan).margin
+        cells = count_planned_cells(model, roads, self.plans_streets)
+        margin = choose_arrangement((2, 2, 2, 2), order, overlap, None, margin, cells).margin
         block_grid = BlockGrid.from_overlap(size, overlap, margin, rank=find_rank(order), num_blocks=None)
         self.composer = BlockComposer(block_grid, model.spec, model.encode, roads=roads)
         self.blocks: dict[BlockIndex, SceneBlock] = {}
@@ -126,9 +126,8 @@ class InfiniteScene:
             first = self.blocks[0, 0].scene
             self.composer.level_m = find_ground_height(first, 0.0, 0.0)
             if self.plans_streets and self.plan is None:
-                label_at = make_label_finder(self.label, self.composer.step_m, first.grid)
-                sketches = list_sketches(self.roads)
-                plan = self.model.plan_streets(first, label_at, self.seed, self.scene_index, sketches)
+                step_m = self.composer.step_m
+                plan = make_street_plan(self.model, first, self.roads, self.label, step_m, self.seed, self.scene_index)
                 self.plan, self.composer.roads = plan, [*self.roads, plan]
         label = self.label_of(index)
         like = self.model.new_identity("city", self.seed, 0, label)

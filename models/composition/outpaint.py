@@ -29,6 +29,7 @@ from models.composition.road_sketch import (
     check_sketch,
 )
 from models.composition.seam_blending import extract_new_part, extrapolate_ground
+from models.composition.street_plan import StreetPlan
 from models.layout import LayoutSpec
 from models.sampling.diffusion import OUTPAINT, InpaintCondition
 from models.sampling.repaint import InpaintingConfig, RePaintConfig
@@ -443,16 +444,46 @@ def make_label_finder(
     return label_at
 
 
-def list_sketches(roads: Sequence[Streets]) -> list[SketchedRoad]:
-    """Return the sketched roads among streets.
+def make_street_plan(
+    model: SceneGenerator,
+    scene: Scene,
+    roads: Sequence[Streets],
+    label: str | Mapping[BlockIndex, str] | Callable[[BlockIndex], str],
+    step_m: float,
+    seed: int,
+    scene_index: int,
+) -> StreetPlan:
+    """Plan the streets around a scene.
 
     Args:
-        roads: Streets.
+        model: Model with a street planner.
+        scene: Scene to extend.
+        roads: Known streets. Sketched roads become part of the plan.
+        label: Label of blocks (`make_label_finder`).
+        step_m: Distance between neighbouring blocks (m).
+        seed: Seed of the noise.
+        scene_index: Index of the scene.
 
     Returns:
-        Sketched roads, which become part of a street plan.
+        The plan.
     """
-    return [one for one in roads if isinstance(one, SketchedRoad)]
+    sketches = [one for one in roads if isinstance(one, SketchedRoad)]
+    return model.plan_streets(scene, make_label_finder(label, step_m, scene.grid), seed, scene_index, sketches)
+
+
+def count_planned_cells(model: SceneGenerator, roads: Sequence[Streets], plans_streets: bool) -> int:
+    """Return the number of latent cells per side of a block if all streets are known, for `choose_arrangement`.
+
+    Args:
+        model: Model.
+        roads: Known streets.
+        plans_streets: Whether streets are planned.
+
+    Returns:
+        Number of cells; 0 if some streets are unknown.
+    """
+    is_known = plans_streets or any(isinstance(one, RoadMap) for one in roads)
+    return model.latent_shape[-1] if is_known else 0
 
 
 def generate_blocks(
@@ -577,8 +608,8 @@ def outpaint_scene(
     )
     composer = BlockComposer(block_grid, model.spec, model.encode, find_ground_height(scene, 0.0, 0.0), roads)
     if plan_streets:
-        label_at = make_label_finder(label, composer.step_m, scene.grid)
-        composer.roads = [*roads, model.plan_streets(scene, label_at, seed, scene_index, list_sketches(roads))]
+        plan = make_street_plan(model, scene, roads, label, composer.step_m, seed, scene_index)
+        composer.roads = [*roads, plan]
     blocks = {(0, 0): SceneBlock(scene, model.encode([scene])[0])}
     for group in block_grid.group_by_rank(index for index in block_grid.indices() if index not in blocks):
         blocks |= generate_blocks(

@@ -14,11 +14,10 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from models.composition.road_sketch import ROAD, SIDEWALK, find_deep_contradiction
 from models.scene import Grid, Scene
+from models.street_planner import PIXEL_M
 
-PIXEL_M = 4.0  # Side of a pixel of a street plan.
 REACH_M = 8.0  # Distances are clipped to this length.
 GAP_M = 12.0  # Gaps of up to this length between roads are closed when streets are drawn.
-SCENE_M = 64.0  # Side of the scenes that street plans continue.
 
 
 def measure_street_distances(road: np.ndarray, paved: np.ndarray, resolution_m: float) -> np.ndarray:
@@ -53,20 +52,6 @@ def measure_street_distances(road: np.ndarray, paved: np.ndarray, resolution_m: 
         parts = [distance_m[r::side, c::side] for r in (half - 1, half) for c in (half - 1, half)]
         found.append(np.mean(parts, axis=0))
     return np.stack(found).astype(np.float32)
-
-
-def measure_border_distances(rows: int, cols: int) -> np.ndarray:
-    """Return the distance of the pixels of a street plan to the border of the plan.
-
-    Args:
-        rows: Number of rows.
-        cols: Number of columns.
-
-    Returns:
-        (rows, cols) distances of the centres (m).
-    """
-    row, col = ((0.5 + np.minimum(np.arange(n), np.arange(n)[::-1])) * PIXEL_M for n in (rows, cols))
-    return np.minimum(row[:, None], col[None, :])
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,10 +21,8 @@ from models.composition.block_grid import BlockGrid, BlockIndex, rank_outward
 from models.composition.road_sketch import SketchedRoad, draw_roads
 from models.composition.street_distances import (
     GAP_M,
-    PIXEL_M,
     REACH_M,
     StreetDistances,
-    measure_border_distances,
     measure_street_distances,
     read_street_masks,
 )
@@ -32,7 +30,7 @@ from models.labels import ANY, compose_label, find_label_index, split_label
 from models.sampling.diffusion import PLAN, InpaintCondition, SceneNoise, sample_with_scheduler, with_known
 from models.sampling.schedulers import SAMPLERS, SchedulerConfig
 from models.scene import Grid, Scene
-from models.street_planner import CHANNELS, LABEL_KIND, StreetPlanner
+from models.street_planner import CHANNELS, LABEL_KIND, PIXEL_M, StreetPlanner, measure_border_distances
 
 SAMPLER = "dpm++"
 SKETCH_RESOLUTION_M = 0.5  # Side of the pixels from which the distances of sketched roads are computed.

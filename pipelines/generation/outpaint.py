@@ -20,10 +20,10 @@ from models.composition.outpaint import (
     SceneBlock,
     Tile,
     check_roads,
+    count_planned_cells,
     find_ground_height,
     generate_blocks,
-    list_sketches,
-    make_label_finder,
+    make_street_plan,
     uses_street_plan,
 )
 from models.composition.road_sketch import RoadMap, SketchedRoad
@@ -491,8 +491,7 @@ def make_plan(pipeline: PrITTIPipeline, request: OutpaintRequest, given: Scene, 
     label = request.labels_map or request.label or find_scene_label(given, kind)
     labels = label_blocks(kind, label, request.num_blocks, request.free_blocks)
     step_m = BlockComposer(block_grid, pipeline.spec, pipeline.encode).step_m
-    label_at = make_label_finder(labels, step_m, given.grid)
-    return pipeline.plan_streets(given, label_at, request.seed, number, list_sketches(request.roads))
+    return make_street_plan(pipeline, given, request.roads, labels, step_m, request.seed, number)
 
 
 def make_plan_path(request: OutpaintRequest, number: int) -> str:
@@ -536,13 +535,13 @@ def outpaint_scenes(
     pipeline = load_pipeline(request.model)
     mode, is_far = str(request.mode or pipeline.config.neighbour_latents), max(request.num_blocks) > 1
     plans_streets = uses_street_plan(pipeline, request.roads, mode, is_far, request.plan_streets)
-    is_planned = plans_streets or any(isinstance(one, RoadMap) for one in request.roads)
+    planned_cells = count_planned_cells(pipeline, request.roads, plans_streets)
     chosen_options = request.order, request.overlap, request.free_blocks, request.margin
     request = replace(
         request,
         mode=mode,
         plan_streets=plans_streets,
-        margin=choose_arrangement(request.num_blocks, *chosen_options, pipeline.latent_shape[-1] * is_planned).margin,
+        margin=choose_arrangement(request.num_blocks, *chosen_options, planned_cells).margin,
         repaint=pipeline.resolve_inpainting(request.repaint),
         constraints=pipeline.resolve_constraints(request.constraints),
     )

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
-from models.composition.street_distances import PIXEL_M, measure_street_distances, read_street_masks
+from models.composition.street_distances import measure_street_distances, read_street_masks
 from models.scene import VEGETATION, VEHICLES, Grid, Scene
-from models.street_planner import CHANNELS
+from models.street_planner import CHANNELS, PIXEL_M
 from pipelines.preprocess.sources.town.generator import TEST_SEEDS_START
 from pipelines.preprocess.sources.town.version2.town import make_large_crops
 from pipelines.runtime import storage
@@ -47,14 +47,13 @@ class TownMaps:
     count: int
 
 
-def plan_street_maps(root: str, num_train: int, num_test: int = NUM_TEST, seed: int = 0) -> list[TownMaps]:
+def plan_street_maps(root: str, num_train: int, num_test: int = NUM_TEST) -> list[TownMaps]:
     """Distribute street maps over towns.
 
     Args:
         root: Dataset directory.
         num_train: Number of maps of the training split.
         num_test: Number of maps of the test split, which come from other towns.
-        seed: Seed; another seed gives other towns.
 
     Returns:
         One entry per town.
@@ -63,7 +62,7 @@ def plan_street_maps(root: str, num_train: int, num_test: int = NUM_TEST, seed: 
     for split, wanted, start in (("train", num_train, 0), ("test", num_test, TEST_SEEDS_START)):
         for number, first in enumerate(range(0, wanted, MAPS_PER_TOWN)):
             shard = Shard(root, SOURCE, split, number)
-            town_seed = SEEDS_START + start + 10_000 * seed + number
+            town_seed = SEEDS_START + start + number
             plan.append(TownMaps(shard, town_seed, min(MAPS_PER_TOWN, wanted - first)))
     return plan
 

@@ -14,7 +14,6 @@ from models.composition.road_sketch import RoadMap, SketchedRoad, draw_roads
 from models.composition.street_distances import (
     REACH_M,
     StreetDistances,
-    measure_border_distances,
     measure_street_distances,
     read_street_masks,
 )
@@ -22,7 +21,7 @@ from models.composition.street_plan import StreetPlan, convert_label
 from models.pipeline import PrITTIPipeline
 from models.sampling.known_regions import NUM_STREET_UNIFORM, STREET_SHARES, make_street_masks
 from models.scene import KITTI_GROUND_CLASSES, Grid
-from models.street_planner import StreetPlanner
+from models.street_planner import StreetPlanner, measure_border_distances
 from pipelines.preprocess.sources.town.version2.town import make_large_crops
 from pipelines.preprocess.street_maps import make_row
 from pipelines.training.street_map_reader import NUM_TURNS, turn_map
