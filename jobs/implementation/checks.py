@@ -18,7 +18,8 @@ from jobs.support.cli import home_path, make_absolute, require_positive, resolve
 from jobs.support.model_directories import find_pipeline_directory, require_model_labels
 from jobs.train_dit import Config as DiTConfig
 from jobs.train_lvae import Config as LVAEConfig
-from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset
+from jobs.train_street_planner import Config as StreetPlannerConfig
+from models.presets import DIT_PRESETS, LVAE_PRESETS, STREET_PLANNER_PRESETS, find_preset
 from models.scene import CATEGORIES, VEGETATION, VEHICLES
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
@@ -75,6 +76,13 @@ def check_train_dit(config: DiTConfig) -> None:
         dataset = Dataset.open(find_training_dataset(config, LVAE_PRESETS[row.lvae].source))
         resolve_label_kind(config, dataset)
         require_latents(make_absolute(config.latents) if config.latents else dataset.root, dataset.root)
+
+
+def check_train_street_planner(config: StreetPlannerConfig) -> None:
+    find_preset(STREET_PLANNER_PRESETS, config.preset)
+    for model in filter(None, (config.model, config.start_from)):
+        find_pipeline_directory(model)
+    require_positive(config, "num_maps")
 
 
 def resolve_label_kind(config: DiTConfig, dataset: Dataset) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from jobs.implementation.checks import check_train_street_planner
 from jobs.support import trainer
 from jobs.support.callbacks import StreetPlanCheck
 from jobs.support.cli import home_path, resolve_path
@@ -34,6 +35,7 @@ from pipelines.training.street_map_reader import StreetMapReader
 
 def prepare(config: Config) -> TrainingRun:
     """Make the street maps if they are missing, and prepare training."""
+    check_train_street_planner(config)
     row = resolve_preset(config)
     start = load_start(config.start_from, row) if config.start_from else None
     root = resolve_path(config.dataset, "datasets", "streets-smoke" if config.preset == "smoke" else "streets")
@@ -92,17 +94,10 @@ def prepare(config: Config) -> TrainingRun:
 
 
 def resolve_preset(config: Config) -> StreetPlannerPreset:
-    """Return the preset with the options that override it.
-
-    Raises:
-        ValueError: The number of maps is below 1.
-    """
+    """Return the preset with the options that override it."""
     row = find_preset(STREET_PLANNER_PRESETS, config.preset)
     names = ("batch_size", "num_maps")
-    row = replace(row, **{name: value for name in names if (value := getattr(config, name)) is not None})
-    if row.num_maps < 1:
-        raise ValueError(f"--num-maps is {row.num_maps}, expected 1 or more")
-    return row
+    return replace(row, **{name: value for name in names if (value := getattr(config, name)) is not None})
 
 
 def make_maps(config: Config, row: StreetPlannerPreset, root: str) -> tuple[list[Shard], list[Shard]]:

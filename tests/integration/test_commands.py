@@ -22,6 +22,7 @@ MISTAKES = {
     ("train_lvae.py", "tiny"): "unknown preset 'tiny', expected one of: smoke, demo, town, town-pixels, kitti360, av2",
     ("train_lvae.py",): "run jobs/preprocess_scenes.py",
     ("train_dit.py", "kitti360"): "run jobs/preprocess_scenes.py",
+    ("train_street_planner.py", "large"): "unknown preset 'large', expected one of: smoke, town",
     ("encode_latents.py",): "run jobs/preprocess_scenes.py",
     ("sample_scenes.py", "--model", "nowhere"): "nowhere: no PrITTI pipeline here, and no included weights",
     ("publish_model.py", "--model", "nowhere"): "nowhere: no PrITTI pipeline here",

@@ -128,7 +128,7 @@ def test_street_planner_joins_a_pipeline(home, tmp_path, monkeypatch):
     assert np.allclose(plain.mean((0, 2, 3)), pipeline.street_planner.config.shift)
     with pytest.raises(ValueError, match="this pipeline has no street planner; omit the option"):
         train(replace(config, name="again", start_from=model))
-    with pytest.raises(ValueError, match="--num-maps is 0, expected 1 or more"):
+    with pytest.raises(ValueError, match="--num-maps is 0, expected at least 1"):
         train(replace(config, name="again", num_maps=0))
 
 
