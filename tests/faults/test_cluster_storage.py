@@ -55,6 +55,7 @@ def s3(folder) -> Iterator[tuple[chaos.Store, list[str]]]:
         yield store, connections
 
 
+@pytest.mark.slow
 def test_output_that_nodes_do_not_share_stops_the_job(folder, tmp_path):
     output = tmp_path / "output"
     output.mkdir()

@@ -245,6 +245,7 @@ def test_same_command_resumes_after_loss_of_the_head(folder, tmp_path):
     assert tables[0] == tables[1] and len(tables[0]) >= 6
 
 
+@pytest.mark.slow
 def test_missing_nodes_come_from_the_autoscaler(folder, tmp_path):
     config = folder / "autoscaler.json"
     config.write_text(json.dumps(AUTOSCALER))

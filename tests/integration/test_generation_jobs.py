@@ -191,6 +191,7 @@ def test_sweep_seams_compares_settings_with_ceiling_and_control(smoke, samples, 
     assert (tmp_path / "sweep/sweep.html").read_text().count("<img") == 4
 
 
+@pytest.mark.slow  # test_evaluate_job.py scores the ceiling and controls.
 def test_evaluate_scores_generated_scenes_and_reconstruction(smoke, samples, tmp_path):
     from jobs.evaluate_scenes import Config
     from jobs.implementation.evaluate_scenes import evaluate

@@ -157,6 +157,7 @@ def test_train_lvae_leaves_finished_run_unchanged(home):
         train(Config(preset="smoke", learning_rate=0.5))
 
 
+@pytest.mark.slow  # tests/faults/test_faults.py kills workers of other stages.
 def test_train_lvae_resumes_after_worker_kills(home, tmp_path, monkeypatch, capsys):
     """A worker dies twice. Ray Train may replace it once; the second round begins because there is a checkpoint."""
     import jobs.support.trainer

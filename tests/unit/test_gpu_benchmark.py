@@ -39,6 +39,7 @@ def run_isolated(*words: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.slow
 def test_rehearsal_needs_only_models_and_sections_merge(tmp_path):
     done = run_isolated("--cpu", "--output", str(tmp_path))
     assert done.returncode == 0, done.stderr[-3000:]

@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from pipelines.schema.tables import read_scenes
 
 
+@pytest.mark.slow  # test_constraints.py samples scenes with constraints.
 def test_sampler_guides_scenes_by_constraints(tmp_path):
     from jobs.support.model_directories import find_pipeline_directory
     from models.layout import SLAB_OFFSET_M

@@ -84,6 +84,7 @@ def find_missed_targets(sample, towns) -> list[str]:
     return missed
 
 
+@pytest.mark.slow
 def test_town_scenes_have_target_statistics(large_sample):
     sample, _, towns = large_sample
     assert len(sample.counts) == 1_000
@@ -94,6 +95,7 @@ def test_town_scenes_have_target_statistics(large_sample):
     assert len(find_missed_targets(more, towns)) > 12
 
 
+@pytest.mark.slow
 def test_town_counts_are_overdispersed_with_every_category(large_sample, version):
     counts = large_sample[0].counts
     dispersion = dict(zip(CATEGORIES, counts.var(axis=0) / counts.mean(axis=0), strict=True))
@@ -106,6 +108,7 @@ def test_town_counts_are_overdispersed_with_every_category(large_sample, version
     assert dispersion["construction_big"] > 1, dispersion
 
 
+@pytest.mark.slow
 def test_town_vegetation_and_relief_are_in_stated_ranges(large_sample):
     """Per label, the medians of count and volume are within the stated ranges (p05 to p95). The tails are close to the
     ranges."""
