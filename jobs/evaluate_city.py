@@ -10,10 +10,10 @@ same label: counts and ground shares per window, label fidelity, distances of di
 Street directions, junctions, city blocks, traffic and seams are measured on the whole scene.
 
 The reference consists of scenes of --real with the label of the cities. If the dataset has crops at free poses, only
-these are used. For cities with --labels-map, each window has the label of the nearest block, and reference and ceiling
-contain all labels. The ceiling consists of windows of large procedural towns with the same label, cut in the same way.
-The control is another run, for example with another order of the blocks. Without --control-run, the control consists of
-windows of the ceiling with moved objects.
+these are used. For cities with --labels-map, each window has the label of the nearest block, reference and ceiling
+contain all labels, and a further table compares the windows of each label with the reference. The ceiling consists of
+windows of large procedural towns with the same label, cut in the same way. The control is another run, for example with
+another order of the blocks. Without --control-run, the control consists of windows of the ceiling with moved objects.
 
 The job writes metrics.json, metrics.parquet, windows.parquet (one row per window), the windows as scene tables and
 city.html, and logs the scores to MLflow. An interrupted run starts again from the beginning.

@@ -16,7 +16,6 @@ from jobs.support.lite0 import prepare_lite0
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scores import publish_scores
-from models.labels import ANY
 from pipelines.evaluation.cities import (
     CEILING,
     REFERENCE,
@@ -26,8 +25,10 @@ from pipelines.evaluation.cities import (
     CityResult,
     Label,
     RunRecord,
+    compute_label_scores,
     compute_quantity_scores,
     compute_whole_scores,
+    format_label,
     measure_cities,
     name_group,
     name_source,
@@ -130,6 +131,9 @@ def evaluate_city(config: Config) -> dict:
             "quantities": {side: compute_quantity_scores(found) for side, found in rows.items()},
             "whole": {side: compute_whole_scores(found, by_side[CEILING]) for side, found in by_side.items()},
         }
+        has_map = any(record.block_labels for record in records.values())
+        if has_map:
+            scores["labels"] = compute_label_scores(rows, (GENERATED, REFERENCE))
         every = [row for found in rows.values() for row in found]
         storage.write_parquet(pa.Table.from_pylist(every), storage.join_uri(output, "windows.parquet"))
         tags = {"generated": generated, "real": dataset.root, "label": format_label(label)}
@@ -137,7 +141,6 @@ def evaluate_city(config: Config) -> dict:
         overviews = [
             Picture(result.city, result.overview, side) for side, found in by_side.items() for result in found[:SHOWN]
         ]
-        has_map = any(record.block_labels for record in records.values())
         how = describe(config, dataset, label, by_side, count, reference_rows, has_map)
         storage.write_text(render_city_html(nested, rows, overviews, how), storage.join_uri(output, "city.html"))
         return nested
@@ -192,11 +195,6 @@ def find_label(cities: list[City], record: RunRecord, option: str) -> Label:
         shown = ", ".join(sorted(format_label(label) for label in labels))
         raise ValueError(f"the cities have the labels {shown}; evaluate one label at a time, or pass --label any-any")
     return labels.pop()
-
-
-def format_label(label: Label) -> str:
-    """Return the name of a label."""
-    return "-".join(part or ANY for part in label)
 
 
 def score_rings(

@@ -7,7 +7,7 @@ consists of windows of large procedural towns, which have no centre.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -59,7 +59,7 @@ class CityResult:
     Attributes:
         side: Name of the set to which the city belongs.
         city: Scene id.
-        rows: One dictionary per window: ahead, left, ring, direction, kept and QUANTITIES.
+        rows: One dictionary per window: ahead, left, ring, direction, kept, label and QUANTITIES.
         angles_m: (n, 18) length of centrelines by direction, per window (m).
         city_blocks_m2: Areas of the city blocks (m^2).
         connectivity: Share of road pixels in the largest connected part.
@@ -297,7 +297,7 @@ def measure_city_windows(
             vehicle_density=vehicle,
             world_xyz_m=(x_m + place[0], y_m + place[1], z_m),
         )
-        rows.append(_make_row(job.side, city, window, values, kept))
+        rows.append(_make_row(job.side, city, window, values, (vegetation, vehicle), kept))
         if kept:
             windows.setdefault(name_source(job.side, window.ring), []).append(scene)
     for source, scenes in windows.items():
@@ -327,7 +327,14 @@ def measure_city_windows(
     )
 
 
-def _make_row(side: str, city: Scene, window: Window, values: np.ndarray, kept: bool = True) -> dict[str, Any]:
+def format_label(label: Label) -> str:
+    """Return the name of a label, such as low-medium or low-any."""
+    return "-".join(part or ANY for part in label)
+
+
+def _make_row(
+    side: str, city: Scene, window: Window, values: np.ndarray, label: Label, kept: bool = True
+) -> dict[str, Any]:
     """Return the row of a window in windows.parquet."""
     return {
         "side": side,
@@ -337,6 +344,7 @@ def _make_row(side: str, city: Scene, window: Window, values: np.ndarray, kept: 
         "ring": window.ring,
         "direction": window.direction,
         "kept": kept,
+        "label": format_label(label),
     } | dict(zip(QUANTITIES, values.tolist(), strict=True))
 
 
@@ -382,7 +390,8 @@ def measure_reference_part(
         scene = replace(scene, grid=grid, height_m=height_m, occupied=occupied)
         scenes.append(scene)
         measured = measure_city(scene, CENTER_M)
-        rows.append(_make_row(REFERENCE, scene, measured.windows[0], measured.quantities[0]))
+        label = scene.vegetation_density, scene.vehicle_density
+        rows.append(_make_row(REFERENCE, scene, measured.windows[0], measured.quantities[0], label))
     Shard(root, REFERENCE, SPLIT, number).write([replace(s, source=REFERENCE, split=SPLIT) for s in scenes])
     return rows, [find_origin_level_m(scene) for scene in scenes]
 
@@ -488,17 +497,37 @@ def compute_quantity_scores(rows: Sequence[dict]) -> dict[str, dict[str, Estimat
     for row in sorted(kept, key=lambda row: row["ring"]):
         groups.setdefault(name_group(row["ring"]), []).append(row)
     groups["all"] = kept
+    return {group: _estimate_quantities(chosen) for group, chosen in groups.items() if chosen}
+
+
+def compute_label_scores(
+    rows: Mapping[str, Sequence[dict]], required: Sequence[str]
+) -> dict[str, dict[str, dict[str, Estimate | None]]]:
+    """Estimate the mean of each quantity by label and side.
+
+    Args:
+        rows: Rows of the windows of each side.
+        required: Sides that must have windows with a label; other labels are left out.
+
+    Returns:
+        For each label: estimates by side and QUANTITIES.
+    """
+    groups: dict[str, dict[str, list[dict]]] = {}
+    for side, found in rows.items():
+        for row in found:
+            if row["kept"]:
+                groups.setdefault(row["label"], {}).setdefault(side, []).append(row)
     return {
-        group: dict(
-            zip(
-                QUANTITIES,
-                compute_scene_means(np.array([[row[name] for name in QUANTITIES] for row in chosen], float)),
-                strict=True,
-            )
-        )
-        for group, chosen in groups.items()
-        if chosen
+        label: {side: _estimate_quantities(found) for side, found in by_side.items()}
+        for label, by_side in sorted(groups.items())
+        if by_side.keys() >= set(required)
     }
+
+
+def _estimate_quantities(rows: Sequence[dict]) -> dict[str, Estimate | None]:
+    """Return the estimated mean of each of QUANTITIES over windows."""
+    values = np.array([[row[name] for name in QUANTITIES] for row in rows], float)
+    return dict(zip(QUANTITIES, compute_scene_means(values), strict=True))
 
 
 def compute_whole_scores(results: Sequence[CityResult], towns: Sequence[CityResult]) -> dict[str, Any]:

@@ -95,6 +95,29 @@ def build_quantity_table(scores: Mapping[str, Any]) -> Table:
     return Table("Quantities by ring", ("quantity", *headings, *ends), rows, note=note)
 
 
+def build_label_table(scores: Mapping[str, Any]) -> Table:
+    """Build the table of the mean of each quantity by label, in cities with several labels."""
+    labels = scores["labels"]
+    rows = [
+        (
+            spell_name(name),
+            *(format_pair(sides["generated"][name], sides["reference"][name]) for sides in labels.values()),
+        )
+        for name in QUANTITIES
+    ]
+    note = (
+        "Each cell holds the mean over the windows with the label, and in brackets that of the reference. The streets"
+        " of the reference are cut at the border of each scene."
+    )
+    return Table("Quantities by label", ("quantity", *labels), rows, note=note)
+
+
+def format_pair(made: Mapping[str, float] | None, real: Mapping[str, float] | None) -> str:
+    """Return the values of two estimates as text, the second one in brackets."""
+    first, second = (format_number(found["value"]) if found else "–" for found in (made, real))
+    return f"{first} ({second})"
+
+
 def build_street_table(scores: Mapping[str, Any]) -> Table:
     """Build the table of street directions and seams by ring. They use all windows of a ring."""
     columns = [
@@ -229,6 +252,7 @@ def render_city_html(
         draw_ring_charts(scores),
         build_street_table(scores),
         build_quantity_table(scores),
+        *([build_label_table(scores)] if "labels" in scores else []),
         build_whole_table(scores),
         Pictures("Cities from above", overviews, 2),
         draw_maps(rows["generated"], expected),

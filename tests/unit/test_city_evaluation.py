@@ -10,6 +10,7 @@ from models.composition.block_grid import RANKS, BlockGrid, label_blocks
 from models.scene import VEGETATION, VEHICLES
 from pipelines.evaluation.cities import (
     CityResult,
+    compute_label_scores,
     compute_quantity_scores,
     compute_street_distances,
     compute_whole_scores,
@@ -22,7 +23,7 @@ from pipelines.evaluation.cities import (
 from pipelines.evaluation.traffic import Traffic
 from pipelines.metrics.cities import QUANTITIES, SEAM_RECORD_SHAPE
 from pipelines.metrics.validity import judge_densities
-from pipelines.reporting.city_report import CELL_PX, draw_map
+from pipelines.reporting.city_report import CELL_PX, build_label_table, draw_map
 from pipelines.schema.density_labels import DensityThresholds
 
 
@@ -110,6 +111,30 @@ def test_quantities_are_averaged_by_ring_over_kept_windows():
     scores = compute_quantity_scores([row(2, 6.0), row(0, 1.0), row(1, 3.0), row(1, np.nan), row(2, 90.0, kept=False)])
     means = {group: found["vehicle_small_per_ha"].value for group, found in scores.items()}
     assert means == {"0-1": 2.0, "2": 6.0, "all": pytest.approx(10 / 3)}
+
+
+def test_quantities_are_averaged_by_label():
+    def row(label, cars, kept=True):
+        return {name: 0.0 for name in QUANTITIES} | {"label": label, "kept": kept, "vehicle_small_per_ha": cars}
+
+    rows = {
+        "generated": [row("low-low", 1.0), row("low-low", 3.0), row("high-any", 9.0)],
+        "reference": [row("low-low", 5.0), row("low-high", 7.0)],
+        "ceiling": [row("low-low", 80.0, kept=False)],
+    }
+    scores = compute_label_scores(rows, ("generated", "reference"))
+    assert list(scores) == ["low-low"] and set(scores["low-low"]) == {"generated", "reference"}
+    written = {
+        label: {
+            side: {name: found and found._asdict() for name, found in estimates.items()}
+            for side, estimates in sides.items()
+        }
+        for label, sides in scores.items()
+    }
+    table = build_label_table({"labels": written})
+    assert table.columns == ("quantity", "low-low")
+    cells = dict(table.rows)
+    assert cells["vehicle small per ha"] == "2 (5)" and cells["road share"] == "0 (0)"
 
 
 def test_whole_cities_are_scored_by_blocks_traffic_and_seams():
