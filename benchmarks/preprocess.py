@@ -31,8 +31,9 @@ from pipelines.preprocess.sources import kitti360
 from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
 from pipelines.runtime import storage
+from pipelines.schema.conversion import make_scene_tables
 from pipelines.schema.dataset import compute_training_statistics
-from pipelines.schema.tables import Shard, make_scene_tables
+from pipelines.schema.tables import Shard
 from pipelines.training.data_loader import LayoutReader
 
 pa.set_cpu_count(1)

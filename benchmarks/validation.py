@@ -23,7 +23,9 @@ import tyro
 from common import describe_machine, spread
 
 from pipelines.runtime import storage
-from pipelines.schema.tables import PRIMITIVES, RASTERS, SCENES, TEXTS, Shard, find_shards, parse_scenes
+from pipelines.schema.columns import PRIMITIVES, RASTERS, SCENES, TEXTS
+from pipelines.schema.conversion import parse_scenes
+from pipelines.schema.tables import Shard, find_shards
 from pipelines.schema.validation import validate_shard, validate_table
 
 SCHEMAS = {"scenes": SCENES, "primitives": PRIMITIVES, "rasters": RASTERS}

@@ -55,7 +55,8 @@ from models.scene import Scene
 from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.runtime import storage
-from pipelines.schema.tables import Shard, make_rejects_table
+from pipelines.schema.conversion import make_rejects_table
+from pipelines.schema.tables import Shard
 
 MARKERS = {
     "unit": (),

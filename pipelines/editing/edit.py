@@ -31,7 +31,8 @@ from models.scene import (
     make_yaw_rotation,
 )
 from pipelines.editing.repair import GroundFaults, find_removable_objects, separate_objects, snap_to_ground
-from pipelines.schema.tables import PRIMITIVES, make_primitives_table
+from pipelines.schema.columns import PRIMITIVES
+from pipelines.schema.conversion import make_primitives_table
 from pipelines.schema.validation import MAX_COORDINATE_M
 
 SIZES_M = (1e-3, 1e3)  # Smallest and largest size after an edit.

@@ -17,9 +17,11 @@ from pipelines.rendering.render import render_bev, render_outlined_bev
 from pipelines.reporting.report import Picture, Pictures, Section, Table, render_report_html
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_tasks
+from pipelines.schema.columns import EDITS, TABLES
+from pipelines.schema.conversion import make_rejects_table
 from pipelines.schema.run_guard import guard_run
 from pipelines.schema.scene_subset import SceneSubset
-from pipelines.schema.tables import EDITS, TABLES, Shard, make_rejects_table, require_written
+from pipelines.schema.tables import Shard, require_written
 
 PICTURE_PX = 512
 OUTLINE_M = 0.4  # Margin between changed objects and their outline (m).

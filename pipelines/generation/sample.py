@@ -22,8 +22,9 @@ from pipelines.editing.edit import Repair
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
 from pipelines.runtime.resources import find_device
+from pipelines.schema.columns import SCENE_TABLES
 from pipelines.schema.run_guard import guard_run
-from pipelines.schema.tables import SCENE_TABLES, Shard, find_unwritten, require_written
+from pipelines.schema.tables import Shard, find_unwritten, require_written
 from pipelines.training.latents import digest_weights
 
 

@@ -12,9 +12,10 @@ from pipelines.io.opendrive import export_opendrive
 from pipelines.io.voxel_import import export_voxels_npz
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_tasks
+from pipelines.schema.conversion import make_rejects_table
 from pipelines.schema.file_names import make_file_name
 from pipelines.schema.scene_subset import SceneSubset
-from pipelines.schema.tables import Shard, make_rejects_table
+from pipelines.schema.tables import Shard
 
 Format = Literal["glb", "ply", "npz", "xodr", "geojson"]
 WRITERS: dict[str, Callable[[Scene], bytes]] = {

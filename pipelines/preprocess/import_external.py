@@ -26,7 +26,8 @@ from pipelines.runtime import storage
 from pipelines.runtime.npz import open_npz
 from pipelines.runtime.ray_tasks import map_tasks
 from pipelines.schema.axis_convention import Axes
-from pipelines.schema.tables import Shard, find_faults, make_rejects_table, make_scene_tables, require_written
+from pipelines.schema.conversion import make_rejects_table, make_scene_tables
+from pipelines.schema.tables import Shard, find_faults, require_written
 from pipelines.schema.validation import validate_table
 
 MAX_FILES_PER_SHARD = 64

@@ -25,9 +25,10 @@ from pipelines.preprocess.sharding import ShardTask
 from pipelines.preprocess.sources.drive import Drive
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import MAX_RETRIES, map_rows
+from pipelines.schema.columns import SCENE_TABLES, SCHEMA_VERSION
 from pipelines.schema.dataset import DESCRIPTION, Statistics, compute_training_statistics, label_scenes
 from pipelines.schema.run_guard import compare_options
-from pipelines.schema.tables import SCENE_TABLES, SCHEMA_VERSION, Shard
+from pipelines.schema.tables import Shard
 
 STAGING = ".staging"
 

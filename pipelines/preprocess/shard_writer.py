@@ -22,8 +22,10 @@ from pipelines.preprocess.sources import argoverse2, custom, kitti360
 from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.town import generator
 from pipelines.runtime import storage
+from pipelines.schema.columns import MAX_HEIGHT_M
+from pipelines.schema.conversion import make_rejects_table, make_scene_tables
 from pipelines.schema.dataset import Extremes, merge_extremes
-from pipelines.schema.tables import MAX_HEIGHT_M, Shard, make_rejects_table, make_scene_tables
+from pipelines.schema.tables import Shard
 
 BATCH_SCENES = 32
 

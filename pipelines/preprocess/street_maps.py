@@ -19,8 +19,9 @@ from pipelines.preprocess.sources.town.generator import TEST_SEEDS_START
 from pipelines.preprocess.sources.town.version2.town import make_large_crops
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_tasks
+from pipelines.schema.columns import make_street_maps_schema
 from pipelines.schema.density_labels import DensityThresholds, classify_density, compute_density_thresholds
-from pipelines.schema.tables import Shard, make_street_maps_schema
+from pipelines.schema.tables import Shard
 
 MAP_PX = 64  # Pixels per side of a street map.
 MAP_M = MAP_PX * PIXEL_M

@@ -9,7 +9,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipelines.schema.tables import SCENES, Shard, find_shards
+from pipelines.schema.columns import SCENES
+from pipelines.schema.tables import Shard, find_shards
 
 SORTS = {
     "vegetation": "vegetation_volume_m3",

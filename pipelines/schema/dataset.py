@@ -14,8 +14,9 @@ import pyarrow as pa
 from models.layout import Bounds, LayoutSpec
 from models.scene import CATEGORIES, GROUND_CLASSES, VEGETATION, VEHICLES, Grid
 from pipelines.runtime import storage
+from pipelines.schema.columns import SCENES
 from pipelines.schema.density_labels import DensityThresholds, classify_density, compute_density_thresholds
-from pipelines.schema.tables import SCENES, Shard
+from pipelines.schema.tables import Shard
 
 DESCRIPTION = "dataset.json"
 Extremes = dict[str, list[list[float]]]  # Name -> [lowest, highest]; both are lists with one value per component.

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 
 from pipelines.runtime import storage
-from pipelines.schema.tables import TABLES
+from pipelines.schema.columns import TABLES
 
 
 def guard_options(

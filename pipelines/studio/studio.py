@@ -23,8 +23,9 @@ from pipelines.io.web_export import export_ground, export_web_scene
 from pipelines.rendering.render import render_bev
 from pipelines.reporting.report import encode_data_uri
 from pipelines.reporting.scene_index import Catalogue
+from pipelines.schema.conversion import parse_scenes
 from pipelines.schema.file_names import make_file_name
-from pipelines.schema.tables import Shard, parse_scenes
+from pipelines.schema.tables import Shard
 from pipelines.studio.limits import StudioError, StudioLimits
 from pipelines.studio.requests import (
     EditsRequest,

@@ -28,7 +28,8 @@ from models.labels import compose_label, find_label_index
 from models.layout import LayoutSpec
 from models.scene import Grid
 from models.tensors import encode_height, encode_layout, encode_primitives, resample_ground
-from pipelines.schema.tables import Shard, find_category_indices, list_ground_steps, parse_scenes, read_fixed_lists
+from pipelines.schema.conversion import find_category_indices, list_ground_steps, parse_scenes, read_fixed_lists
+from pipelines.schema.tables import Shard
 from pipelines.schema.validation import validate_shard
 
 WINDOW_SHARDS = 4

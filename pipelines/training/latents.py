@@ -17,8 +17,9 @@ from models.tensors import make_layout_batch
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
 from pipelines.runtime.resources import find_device
+from pipelines.schema.columns import make_latents_schema, make_street_latents_schema
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.tables import Shard, find_shards, make_latents_schema, make_street_latents_schema
+from pipelines.schema.tables import Shard, find_shards
 
 
 def digest_weights(model: torch.nn.Module) -> str:

@@ -11,7 +11,8 @@ import pytest
 from helpers import studio_scene
 
 from pipelines.runtime import storage
-from pipelines.schema.tables import Shard, make_scene_tables
+from pipelines.schema.conversion import make_scene_tables
+from pipelines.schema.tables import Shard
 
 ESCAPE = "../../../escaped"
 SCRIPT = "<!--<script>alert(1)</script>"

@@ -6,8 +6,9 @@ import pytest
 from helpers import random_scene
 
 from pipelines.runtime import storage
+from pipelines.schema.conversion import make_rejects_table
 from pipelines.schema.run_guard import guard_run
-from pipelines.schema.tables import Shard, make_rejects_table
+from pipelines.schema.tables import Shard
 
 
 def test_run_guard_releases_name_of_empty_run(tmp_path):

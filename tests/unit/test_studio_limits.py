@@ -12,7 +12,8 @@ from helpers import random_scene, studio_scene
 from starlette.testclient import TestClient
 
 from pipelines.runtime import storage
-from pipelines.schema.tables import Shard, make_scene_tables
+from pipelines.schema.conversion import make_scene_tables
+from pipelines.schema.tables import Shard
 from pipelines.studio.access import COOKIE, COOKIE_AGE_S, Gate
 from pipelines.studio.api import build_studio_app
 from pipelines.studio.limits import StudioError, StudioLimits

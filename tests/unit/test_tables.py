@@ -12,7 +12,8 @@ from helpers import random_scene
 from models.scene import Grid
 from pipelines.runtime import storage
 from pipelines.runtime.machines import identify_machine
-from pipelines.schema.tables import HEIGHT_STEP_M, PRIMITIVES, SCENES, Shard, find_shards, read_scenes
+from pipelines.schema.columns import HEIGHT_STEP_M, PRIMITIVES, SCENES
+from pipelines.schema.tables import Shard, find_shards, read_scenes
 
 
 def assert_same(a, b):

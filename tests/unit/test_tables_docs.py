@@ -29,8 +29,7 @@ from pipelines.preprocess.sources import argoverse2, kitti360
 from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.preprocess.street_maps import write_street_maps
 from pipelines.runtime import storage
-from pipelines.schema.density_labels import classify_density, compute_density_thresholds
-from pipelines.schema.tables import (
+from pipelines.schema.columns import (
     CATEGORY_MEANING,
     EDITS,
     HEIGHT_STEP_M,
@@ -38,13 +37,13 @@ from pipelines.schema.tables import (
     RASTERS,
     REJECTS,
     SCENES,
-    Shard,
     make_latents_schema,
-    make_rejects_table,
     make_street_latents_schema,
     make_street_maps_schema,
-    read_scenes,
 )
+from pipelines.schema.conversion import make_rejects_table
+from pipelines.schema.density_labels import classify_density, compute_density_thresholds
+from pipelines.schema.tables import Shard, read_scenes
 
 PAGE = ROOT / "docs/reference/tables.md"
 SCHEMAS = {

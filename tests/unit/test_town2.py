@@ -29,7 +29,8 @@ from pipelines.preprocess.sources.town.version2.footprints import (
     measure_penetration,
     separate_buildings,
 )
-from pipelines.schema.tables import SCENES, Shard
+from pipelines.schema.columns import SCENES
+from pipelines.schema.tables import Shard
 
 BUILDING = CATEGORY_INDEX["construction_big"]
 # Digest of the towns of version 1 with these seeds. A change of these values changes the data of released weights.

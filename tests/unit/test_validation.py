@@ -12,7 +12,8 @@ import pytest
 from helpers import random_scene
 
 from pipelines.runtime import storage
-from pipelines.schema.tables import Shard, find_shards, make_scene_tables
+from pipelines.schema.conversion import make_scene_tables
+from pipelines.schema.tables import Shard, find_shards
 from pipelines.schema.validation import validate_shard, validate_table
 
 TABLES = ("scenes", "primitives", "rasters")
