@@ -14,9 +14,9 @@ job writes scene tables with source=generated-<run> and one GLB file per scene. 
 one GLB file per tile, a 3D Tiles tileset, glb/<run>/<scene>/tileset.json, and a page that shows the city in 3D,
 pages/<run>/<scene>/index.html. No process then holds a whole city.
 
-The tables in block_tables/ contain the share of known ground in each block. The job generates a block as soon as all
-neighbours that the block depends on are complete. The result does not depend on the number of actors. Run the same
-command again to resume after an interruption.
+The tables in block_tables/ contain `known_ground`, the share of the known pixels of each block that have ground. The
+job generates a block as soon as all neighbours that the block depends on are complete. The result does not depend on
+the number of actors. Run the same command again to resume after an interruption.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Config(RePaintOptions):
     """Overlap of neighbouring blocks, as a share of the block size (default: 0.5 for outward, 0.25 for colours)."""
     order: Literal["outward", "colours"] | None = None
     """Order of blocks: outward from the scene, as in the paper, or four groups of independent blocks (needs --overlap <
-    0.5; default: outward for one block on each side, colours over longer distances, where outward drifts)."""
+    0.5; default: outward with at most one block per side, else colours, because outward drifts over long distances)."""
     margin: float | None = None
     """Width of the outermost part of a block that its neighbours generate again, as a share of the block size. It must
     be less than half of --overlap (default: 0.0625 if all streets are known from a plan or a map, else 0)."""
@@ -65,7 +65,7 @@ class Config(RePaintOptions):
     free_blocks: Literal["none", "off-street", "all"] | None = None
     """Blocks that are sampled as crops at any place and heading, instead of views of a vehicle: those that do not lie
     ahead of or behind the given scene (off-street), or all generated blocks. Only models with labels such as
-    low-medium-free distinguish both (default: none for one block on each side, all over longer distances)."""
+    low-medium-free distinguish both (default: none with at most one block per side, else all)."""
     road_sketch: str = ""
     """File with roads that the generated blocks contain. JSON: a list of {"points_m": [[x, y], ...], "width_m": 7,
     "sidewalk_m": 2}, in metres in the frame of the given scene, x ahead and y to the left. PNG: a map with white roads,

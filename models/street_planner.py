@@ -1,7 +1,7 @@
 """Network that plans streets: a U-Net for the signed distances of street plans (composition/street_plan.py).
 
-The U-Net is `UNet2DModel` of the library `diffusers`. After 1,500 training steps, a transformer like `models.dit.DiT`
-did not yet connect the streets of neighbouring patches. Convolutions do so from the start.
+The U-Net is `UNet2DModel` of the library `diffusers`. A transformer like `models.dit.DiT` learns more slowly to connect
+streets across patches (docs/experiments/cities.md).
 """
 
 from __future__ import annotations
@@ -116,8 +116,11 @@ class StreetPlanner(DiffusionModel):
         register_computed_buffers(self)
 
     def compute_buffers(self) -> dict[str, Tensor]:
-        """Return per timestep the weights of the latent and of v in the noise, and the distances (size, size) of the
-        pixels of a scene in the middle to its border, 0 outside (m).
+        """Return the precomputed buffers.
+
+        Returns:
+            noise_shares: weights of the latent and of v in the noise, per timestep. border_m: (size, size) distances of
+            pixels to the border of a scene in the middle; 0 outside (m).
         """
         size, side = self._size, min(round(SCENE_M / PIXEL_M), self._size)
         border_m = torch.zeros(size, size)

@@ -26,7 +26,8 @@ from models.scene import Grid, Scene
 class InfiniteScene:
     """An unbounded scene of blocks.
 
-    Block (0, 0) sets the ground height. With the default order, the cost of a block is bounded. Generated blocks are
+    Block (0, 0) sets the ground height. With the default order and without a street plan, the cost of a block is
+    bounded. A distant section of a street plan needs all sections between it and the first one. Generated blocks are
     kept in memory until `drop_block` is called.
 
     Args:

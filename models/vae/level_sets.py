@@ -5,9 +5,9 @@ height at nodes. Uniform cubic B-splines evaluate both, which are therefore twic
 covers the points with a positive signed distance. Its occupancy logit is the signed distance times a learned slope. The
 paper has one logit per pixel instead.
 
-The network computes the nodes of one latent cell together, so height nodes alternate a little from node to node. With
-two nodes per cell, slopes at the borders of cells would be 40 % larger than in the middle of cells, and would look like
-seams. The coefficients of heights are therefore averaged over neighbouring nodes.
+The network computes the nodes of one latent cell together, so the coefficients of heights alternate a little from node
+to node. Without averaging, slopes at the borders of cells are a third larger than in the middle of cells. The
+coefficients of heights are therefore averaged over neighbouring nodes.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from models.vae.ground import (
 @lru_cache(maxsize=16)
 @torch.inference_mode(False)
 def make_spline_matrix(
-    num_nodes: int, num_points: int, device: torch.device | str = "cpu", smooth: bool = False
+    num_nodes: int, num_points: int, device: torch.device | str = "cpu", average: bool = False
 ) -> Float[Tensor, "points nodes"]:
     """Return the matrix that evaluates a uniform cubic B-spline at the centres of pixels.
 
-    Nodes and pixels divide the same interval. Both lie at the centres of their parts. Beyond the first and the last
-    node, the coefficients of these nodes are repeated.
+    The interval is divided into `num_nodes` equal parts with a node at each centre, and into `num_points` pixels.
+    Beyond the first and the last node, the coefficients of these nodes are repeated.
 
     Args:
         num_nodes: Number of nodes, which carry the coefficients.
         num_points: Number of pixels.
         device: Device of the result.
-        smooth: Whether each coefficient is first averaged with its two neighbours, with the weights 1/4, 1/2 and 1/4.
+        average: Whether each coefficient is first averaged with its two neighbours, with the weights 1/4, 1/2 and 1/4.
             This removes alternating coefficients.
 
     Returns:
@@ -59,7 +59,7 @@ def make_spline_matrix(
     weights = torch.stack([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3], dim=1) / 6
     nodes = (first.long()[:, None] + torch.arange(-1, 3)).clamp(0, num_nodes - 1)
     matrix = torch.zeros(num_points, num_nodes, dtype=torch.float64).scatter_add_(1, nodes, weights)
-    if smooth:
+    if average:
         node = torch.arange(num_nodes)
         mean = torch.zeros(num_nodes, num_nodes, dtype=torch.float64)
         for offset, weight in ((-1, 0.25), (0, 0.5), (1, 0.25)):
@@ -108,7 +108,7 @@ class LevelSetDecoder(nn.Module):
         nodes = self.decode_nodes(latent)
         with torch.autocast(nodes.device.type, enabled=False):
             size, count = nodes.shape[-1], raster_px or nodes.shape[-1] * self.node_px
-            points, means = (make_spline_matrix(size, count, nodes.device, smooth) for smooth in (False, True))
+            points, means = (make_spline_matrix(size, count, nodes.device, average) for average in (False, True))
             height, distance = nodes.float().chunk(2, dim=1)
             height, distance = means @ height @ means.T, points @ distance @ points.T
             return height, self.log_slope.float().exp() * distance, distance

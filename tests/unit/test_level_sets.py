@@ -38,13 +38,13 @@ def test_spline_matrix_equals_scipy():
     assert np.allclose(ours, spline((np.arange(points) + 0.5) * nodes / points - 0.5), atol=1e-6)
 
 
-def test_smooth_splines_keep_slopes_and_remove_alternation():
-    smooth, plain = (make_spline_matrix(32, 128, smooth=smooth).numpy() for smooth in (True, False))
+def test_averaged_splines_keep_slopes_and_remove_alternation():
+    mean, plain = (make_spline_matrix(32, 128, average=average).numpy() for average in (True, False))
     inside = slice(12, -12)  # The outermost coefficients are repeated beyond the border.
     node = np.arange(32)
-    assert np.allclose((smooth @ node)[inside], (plain @ node)[inside], atol=1e-5)
+    assert np.allclose((mean @ node)[inside], (plain @ node)[inside], atol=1e-5)
     assert np.abs(plain @ (-1.0) ** node)[inside].max() > 0.3
-    assert np.abs(smooth @ (-1.0) ** node)[inside].max() < 1e-6
+    assert np.abs(mean @ (-1.0) ** node)[inside].max() < 1e-6
 
 
 def test_level_sets_have_same_shape_at_any_resolution():
