@@ -48,6 +48,7 @@ INDEX_RULES: dict[str, Rule] = {
     "constraints": Flag(),
     "attach": Flag(),
     "pag_scale": Number(0, MAX_PAG_SCALE),
+    "street_pag_factor": Number(0, 1),
 }
 
 
@@ -87,6 +88,8 @@ class ConfiguredPipeline:
             not do this.
         pag_scale: Default scale of perturbed-attention guidance (`DiT.apply_modulations`) at noisy timesteps; 0
             switches it off, as in the paper.
+        street_pag_factor: Factor of this scale for outpainted blocks that know all streets, from a plan or a map. Known
+            streets support the attention, so the same scale adds too many small objects.
         street_planner: Network that plans the streets of large scenes (models/composition/street_plan.py); None: blocks
             do not follow a plan, as in the paper.
 
@@ -106,6 +109,7 @@ class ConfiguredPipeline:
         constraints: bool = False,
         attach: bool = True,
         pag_scale: float = 0.0,
+        street_pag_factor: float = 1.0,
         num_inference_steps: int = NUM_INFERENCE_STEPS,
         street_planner: StreetPlanner | None = None,
     ) -> None:
@@ -124,6 +128,7 @@ class ConfiguredPipeline:
             constraints=constraints,
             attach=attach,
             pag_scale=pag_scale,
+            street_pag_factor=street_pag_factor,
         )
         self.execution = SamplingExecution()
         # What the last denoiser depends on, its labels, and the denoiser.
@@ -443,14 +448,15 @@ class ConfiguredPipeline:
             raise ValueError(f"existence_threshold is {existence_threshold}, expected between 0 and 1")
         return existence_threshold
 
-    def resolve_inpainting(self, repaint: InpaintingConfig | None) -> InpaintingConfig:
+    def resolve_inpainting(self, repaint: InpaintingConfig | None, knows_streets: bool = False) -> InpaintingConfig:
         """Return options of inpainting and outpainting, or the default of the model if the argument is None.
 
         Args:
             repaint: Options; None: the default.
+            knows_streets: Whether all streets are known, from a plan or a map.
 
         Returns:
-            The options with a number of steps. By default, an inpainting network uses the sampler of the pipeline.
+            The options with all numbers. By default, an inpainting network uses the sampler of the pipeline.
             Pipelines of the paper's presets use RePaint as in the paper, the others `RePaintConfig.guided()`.
 
         Raises:
@@ -462,4 +468,9 @@ class ConfiguredPipeline:
             repaint = repaint or chosen
         if isinstance(repaint, RePaintConfig):
             return repaint
-        return replace(repaint, num_inference_steps=repaint.num_inference_steps or self.config.num_inference_steps)
+        default = self.config.street_pag_factor if knows_streets else 1.0
+        return replace(
+            repaint,
+            num_inference_steps=repaint.num_inference_steps or self.config.num_inference_steps,
+            pag_factor=default if repaint.pag_factor is None else repaint.pag_factor,
+        )

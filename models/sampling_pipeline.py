@@ -276,6 +276,7 @@ class SamplingPipeline(ConfiguredPipeline):
         purpose: int = GENERATE,
         condition: InpaintCondition | None = None,
         known_guidance_scale: float = 1.0,
+        pag_factor: float = 1.0,
     ) -> Float[Tensor, "b c h w"]:
         """Sample latents. Each latent depends only on the seed, its index, its label and its condition.
 
@@ -290,6 +291,7 @@ class SamplingPipeline(ConfiguredPipeline):
             purpose: Purpose of the noise: GENERATE, OUTPAINT or INPAINT (models/sampling/diffusion.py).
             condition: Known part of the latents, which an inpainting network continues.
             known_guidance_scale: Scale of guidance by the known part; 1 switches this guidance off.
+            pag_factor: Factor of the scale of perturbed-attention guidance.
 
         Returns:
             Latents.
@@ -302,7 +304,8 @@ class SamplingPipeline(ConfiguredPipeline):
         label, noise_scaling = self.label_tensor(labels), self.resolve_noise_scaling(noise_scaling)
         steps: int = self.config.num_inference_steps if num_inference_steps is None else num_inference_steps
         timesteps = self._select_timesteps(steps)
-        model = scale_noise(self.make_denoiser(timesteps, label, guidance_scale), noise_scaling)
+        pag_scale = self.pag_scale * pag_factor
+        model = scale_noise(self.make_denoiser(timesteps, label, guidance_scale, pag_scale), noise_scaling)
         if condition is not None:
             model = with_known(model, condition, self.diffusion, known_guidance_scale)
         with (
@@ -420,6 +423,7 @@ class SamplingPipeline(ConfiguredPipeline):
                 purpose=purpose,
                 condition=condition,
                 known_guidance_scale=repaint.known_guidance_scale,
+                pag_factor=1.0 if repaint.pag_factor is None else repaint.pag_factor,
             )
         schedule = SamplingSchedule(self.diffusion, repaint.num_inference_steps, repaint.eta)
         noise = SceneNoise(seed, indices, self.latent_shape, self.device, purpose)

@@ -151,11 +151,12 @@ class SceneGenerator(Protocol):
         """
         ...
 
-    def resolve_inpainting(self, repaint: InpaintingConfig | None) -> InpaintingConfig:
+    def resolve_inpainting(self, repaint: InpaintingConfig | None, knows_streets: bool = False) -> InpaintingConfig:
         """Return options of inpainting and outpainting.
 
         Args:
             repaint: Options; None: the default of the model (`PrITTIPipeline.resolve_inpainting`).
+            knows_streets: Whether all streets are known, from a plan or a map.
 
         Returns:
             The options.

@@ -176,6 +176,11 @@ class BlockComposer:
         self.roads = roads
 
     @property
+    def knows_streets(self) -> bool:
+        """True if all streets are known, from a plan or a map."""
+        return any(isinstance(one, RoadMap | StreetPlan) for one in self.roads)
+
+    @property
     def step_px(self) -> int:
         """Distance between neighbouring blocks in pixels."""
         return self.block_grid.step * (self.spec.grid.rows // self.block_grid.size)
@@ -534,7 +539,7 @@ def generate_blocks(
     keys = [(scene_index, *index) for index in indices]
     alone = [not as_paper and (c.is_empty or c.known_ground < MIN_KNOWN_GROUND) for c in conditions]
     latents, masks = (torch.stack(values) for values in zip(*((c.latent, c.mask) for c in conditions), strict=True))
-    repaint = model.resolve_inpainting(repaint)
+    repaint = model.resolve_inpainting(repaint, composer.knows_streets)
     masks[alone] = 1.0
     for new in (True, False):
         chosen = [k for k, one in enumerate(alone) if one == new]

@@ -59,6 +59,8 @@ class TrainedInpainting:
         num_inference_steps: Number of denoising steps; None: the default of the pipeline.
         known_guidance_scale: Scale of guidance by the known part (`models.sampling.diffusion.with_known`); 1 switches
             this guidance off.
+        pag_factor: Factor of the scale of perturbed-attention guidance; None: `street_pag_factor` of the pipeline if
+            all streets are known, else 1.
 
     Raises:
         ValueError: The guidance scale is out of range.
@@ -66,6 +68,7 @@ class TrainedInpainting:
 
     num_inference_steps: int | None = None
     known_guidance_scale: float = 1.0
+    pag_factor: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.known_guidance_scale <= MAX_GUIDANCE_SCALE:

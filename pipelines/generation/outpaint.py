@@ -542,7 +542,7 @@ def outpaint_scenes(
         mode=mode,
         plan_streets=plans_streets,
         margin=choose_arrangement(request.num_blocks, *chosen_options, planned_cells).margin,
-        repaint=pipeline.resolve_inpainting(request.repaint),
+        repaint=pipeline.resolve_inpainting(request.repaint, planned_cells > 0),
         constraints=pipeline.resolve_constraints(request.constraints),
     )
     block_grid = request.make_block_grid(pipeline.latent_shape[-1])

@@ -163,7 +163,8 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
     if "repaint" in options and options["repaint"].get("eta") != 1:
         options["noise_scaling"] = pipeline.config.noise_scaling
     if "repaint" in options and "eta" not in options["repaint"]:
-        options["sampler"], options["pag_scale"] = pipeline.scheduler_config.class_name, pipeline.pag_scale
+        options["sampler"] = pipeline.scheduler_config.class_name
+        options["pag_scale"] = pipeline.pag_scale * options["repaint"].pop("pag_factor")
     guard_run(options.pop("output"), request.source, request.run, options, parts)
 
 

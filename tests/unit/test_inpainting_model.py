@@ -11,6 +11,7 @@ from torch import Tensor
 from models.composition.block_grid import choose_arrangement, label_blocks
 from models.composition.infinite import InfiniteScene
 from models.composition.inpaint import make_latent_mask
+from models.composition.road_sketch import RoadMap
 from models.dit import DiT
 from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS
@@ -182,10 +183,33 @@ def test_default_of_inpainting_depends_on_the_model(pipeline):
     assert plain.resolve_inpainting(None) == RePaintConfig.guided()
     plain.register_to_config(neighbour_latents="paper")
     assert plain.resolve_inpainting(None) == RePaintConfig() and plain.resolve_inpainting(QUICK) == QUICK
-    assert pipeline.resolve_inpainting(None) == TrainedInpainting(pipeline.config.num_inference_steps)
+    assert pipeline.resolve_inpainting(None) == TrainedInpainting(pipeline.config.num_inference_steps, pag_factor=1.0)
     assert pipeline.resolve_inpainting(TrainedInpainting(7)).num_evaluations == 7
     with pytest.raises(ValueError, match="no inpainting model"):
         plain.inpaint_latents(draw_condition(plain.latent_shape, 3), ["low", "low"], 0, [0, 1], TrainedInpainting(5))
+
+
+def test_known_streets_reduce_the_attention_guidance(monkeypatch):
+    pipeline = make_inpainting(tiny_pipeline(small_spec()))
+    pipeline.register_to_config(pag_scale=2.0, street_pag_factor=0.5)
+    pipeline.use_pag(None)
+    pipeline.use_sampler("dpm++")
+    scales, make = [], pipeline.make_denoiser
+
+    def record(timesteps, label, guidance_scale=1.0, pag_scale=None):
+        scales.append(pag_scale)
+        return make(timesteps, label, guidance_scale, pag_scale)
+
+    monkeypatch.setattr(pipeline, "make_denoiser", record)
+    streets = RoadMap.from_classes(np.zeros((256, 256), np.uint8), 1.0)
+    scene, one_ahead = random_scene(2, grid=pipeline.spec.grid), {"num_blocks": (1, 0, 0, 0)}
+    few = TrainedInpainting(4)
+    pipeline.outpaint(scene, "low", repaint=few, **one_ahead)
+    pipeline.outpaint(scene, "low", repaint=few, roads=[streets], **one_ahead)
+    pipeline.outpaint(scene, "low", repaint=replace(few, pag_factor=0.25), roads=[streets], **one_ahead)
+    pipeline.use_pag(1.5)
+    pipeline.outpaint(scene, "low", repaint=few, roads=[streets], **one_ahead)
+    assert scales == [2.0, 1.0, 0.5, 0.75]
 
 
 def test_pipeline_with_inpainting_survives_saving(pipeline, tmp_path):
