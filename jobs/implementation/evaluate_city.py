@@ -52,6 +52,7 @@ DAMAGE = "moved"  # Damage of the default control.
 ENOUGH_WINDOWS = 100
 MIN_WINDOWS = 6  # Scores with 3 neighbours need more than 3 windows.
 MIN_EXTENT_M = 192.0  # Rings 0 and 1.
+MAX_TOWN_EXTENT_M = 576.0  # Side of a town of the ceiling: 9 x 9 windows.
 SHOWN = 2  # Number of overviews per side.
 
 
@@ -98,8 +99,9 @@ def evaluate_city(config: Config) -> dict:
         for side, listed in cities.items()
         for number, city in enumerate(listed)
     ]
+    town_m = min(extent_m, MAX_TOWN_EXTENT_M)
     jobs += [
-        CityRequest(CEILING, k, town_seed=TOWN_SEEDS_START + k, extent_m=extent_m, traffic=traffic, label=label)
+        CityRequest(CEILING, k, town_seed=TOWN_SEEDS_START + k, extent_m=town_m, traffic=traffic, label=label)
         for k in range(config.num_towns)
     ]
     with hold_output(output, "evaluation", config):
