@@ -19,7 +19,7 @@ import numpy as np
 import shapely
 from scipy.interpolate import CubicSpline
 
-from models.scene import ROAD_CLASSES, Scene
+from models.scene import ROAD_CLASSES, Grid, Scene
 from pipelines.geometry.centerlines import Road, RoadNetwork, extract_road_network
 from pipelines.geometry.ground_polygons import build_ground_polygons
 
@@ -31,6 +31,7 @@ WIDEST = 1.15  # Largest width of a side, as a multiple of half the usual width 
 NARROWEST = 0.5  # Smallest width of a side, as such a multiple.
 SIDEWALK_M = (0.8, 6.0)  # Smallest median width and largest width of a sidewalk lane.
 KERB_M = 0.12  # Height of a sidewalk lane above the road.
+MAX_PX = 2048  # Larger scenes are divided into parts of this side, because polygons need about 200 bytes per pixel.
 SAMPLES = 64  # Number of samples that measure the length of a cubic curve.
 
 
@@ -122,9 +123,7 @@ def fit_reference_lines(network: RoadNetwork, scene: Scene) -> list[ReferenceLin
         CLEAR * max(float(np.median(road.width_m)) for road in network.list_leaving(node)) / 2
         for node in range(len(network.nodes_m))
     ]
-    shapes = build_ground_polygons(scene)
-    area = shapely.union_all([shapes[name] for name in ROAD_CLASSES if name in shapes])
-    sidewalk = shapes.get("sidewalk", shapely.MultiPolygon())
+    area, sidewalk = _build_street_polygons(scene)
     shapely.prepare([area, sidewalk])
     return [
         _fit_sides(
@@ -134,6 +133,20 @@ def fit_reference_lines(network: RoadNetwork, scene: Scene) -> list[ReferenceLin
         )
         for road in network.roads
     ]
+
+
+def _build_street_polygons(scene: Scene) -> tuple[shapely.Geometry, shapely.Geometry]:
+    """Return the polygons of the roads and of the sidewalks of a scene."""
+    grid, size_m = scene.grid, scene.grid.resolution_m
+    roads, sidewalks = [], []
+    for row in range(0, grid.rows, MAX_PX):
+        for col in range(0, grid.cols, MAX_PX):
+            counts = min(MAX_PX, grid.rows - row), min(MAX_PX, grid.cols - col)
+            part = Grid(grid.front_m - row * size_m, grid.left_m - col * size_m, size_m, *counts)
+            shapes = build_ground_polygons(scene.crop(part))
+            roads += [shapes[name] for name in ROAD_CLASSES if name in shapes]
+            sidewalks += [shapes["sidewalk"]] if "sidewalk" in shapes else []
+    return shapely.union_all(roads), shapely.union_all(sidewalks)
 
 
 def _shorten_road(road: Road, from_start_m: float, from_end_m: float) -> ReferenceLine:

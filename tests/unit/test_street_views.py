@@ -288,6 +288,18 @@ def test_opendrive_follows_schema_and_centerlines(town_scenes, schema):
     assert counted > 8
 
 
+def test_opendrive_of_large_scenes_is_measured_in_parts(town_scenes, monkeypatch):
+    for scene in town_scenes[:2]:
+        network = extract_road_network(scene)
+        whole = fit_reference_lines(network, scene)
+        with monkeypatch.context() as patch:
+            patch.setattr("pipelines.io.opendrive.MAX_PX", 100)
+            parts = fit_reference_lines(network, scene)
+        for one, other in zip(whole, parts, strict=True):
+            assert np.abs(one.sides_m - other.sides_m).max() < 0.3
+            assert np.median(np.abs(one.sides_m - other.sides_m)) < 0.01
+
+
 def test_opendrive_junction_connects_lanes_of_its_roads(schema):
     root = ET.fromstring(export_opendrive(make_scene_of_roads([STRAIGHT, SIDE], 6.5)))
     roads = {road.get("id"): road for road in root.findall("road")}
