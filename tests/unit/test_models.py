@@ -349,7 +349,10 @@ def test_losses_equal_their_equations():
     assert np.isclose(float(compute_kl_loss(posterior)), float(want), rtol=1e-5)
 
 
-@pytest.mark.parametrize("decoder, steps, rate, clip", [("detr", 400, 3e-3, 0.1), ("cells", 350, 1e-2, np.inf)])
+@pytest.mark.parametrize(
+    "decoder, steps, rate, clip",
+    [pytest.param("detr", 400, 3e-3, 0.1, marks=pytest.mark.slow), ("cells", 350, 1e-2, np.inf)],
+)
 def test_lvae_overfits_one_batch(decoder, steps, rate, clip):
     """Both decoders find all 40 primitives of two scenes within 1 m, and no others. DETR's paper also clips at 0.1."""
     spec = small_spec()
