@@ -123,20 +123,24 @@ def fit_reference_lines(network: RoadNetwork, scene: Scene) -> list[ReferenceLin
         CLEAR * max(float(np.median(road.width_m)) for road in network.list_leaving(node)) / 2
         for node in range(len(network.nodes_m))
     ]
-    area, sidewalk = _build_street_polygons(scene)
-    shapely.prepare([area, sidewalk])
-    return [
-        _fit_sides(
-            _shorten_road(road, *(clear_m[node] if node >= 0 else 0.0 for node in (road.start, road.end))),
-            area,
-            sidewalk,
-        )
-        for road in network.roads
-    ]
+    roads, sidewalks = _build_street_polygons(scene)
+    lines = []
+    for road in network.roads:
+        line = _shorten_road(road, *(clear_m[node] if node >= 0 else 0.0 for node in (road.start, road.end)))
+        lines.append(_fit_sides(line, *(_cut_near_road(parts, line) for parts in (roads, sidewalks))))
+    return lines
 
 
-def _build_street_polygons(scene: Scene) -> tuple[shapely.Geometry, shapely.Geometry]:
-    """Return the polygons of the roads and of the sidewalks of a scene."""
+def _cut_near_road(parts: np.ndarray, line: ReferenceLine) -> shapely.Geometry:
+    """Return the area of polygons that the rays of `_fit_sides` can reach: whole cities have very large polygons."""
+    place = line.curve(line.breaks)[:, :2]
+    margin_m = 2 * WIDEST * float(np.median(line.width_m)) + SIDEWALK_M[1]
+    bounds = *(place.min(axis=0) - margin_m), *(place.max(axis=0) + margin_m)
+    return shapely.union_all(shapely.make_valid(shapely.clip_by_rect(parts, *bounds)))
+
+
+def _build_street_polygons(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return the polygons of the roads and of the sidewalks of each part of a scene."""
     grid, size_m = scene.grid, scene.grid.resolution_m
     roads, sidewalks = [], []
     for row in range(0, grid.rows, MAX_PX):
@@ -146,7 +150,7 @@ def _build_street_polygons(scene: Scene) -> tuple[shapely.Geometry, shapely.Geom
             shapes = build_ground_polygons(scene.crop(part))
             roads += [shapes[name] for name in ROAD_CLASSES if name in shapes]
             sidewalks += [shapes["sidewalk"]] if "sidewalk" in shapes else []
-    return shapely.union_all(roads), shapely.union_all(sidewalks)
+    return np.array(roads, object), np.array(sidewalks, object)
 
 
 def _shorten_road(road: Road, from_start_m: float, from_end_m: float) -> ReferenceLine:
