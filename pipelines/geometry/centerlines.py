@@ -80,7 +80,11 @@ class RoadNetwork:
         Returns:
             Roads that start at the node. Roads that end at the node are reversed.
         """
-        return [r for road in self.roads for r in (road, road.reverse()) if r.start == node]
+        leaving = []
+        for road in self.roads:
+            leaving += [road] if road.start == node else []
+            leaving += [road.reverse()] if road.end == node else []
+        return leaving
 
 
 def extract_road_network(scene: Scene, spacing_m: float = 1.0) -> RoadNetwork:

@@ -359,7 +359,7 @@ def _make_junction(root: ET.Element, network: RoadNetwork, lines: list[Reference
         right_m = np.array(right_m) * lanes / [list_lanes(lines[come]), list_lanes(lines[go])]
         sides_m = np.stack([right_m, right_m], axis=1)
         line = ReferenceLine.through(np.stack([a_m, b_m]), sides_m, np.stack([a_way, b_way]))
-        number = sum(1 for _ in root.iter("road"))
+        number = len(root) - 1  # The header precedes the roads.
         road = _make_road(root, number, line, junction=int(_make_junction_id(node)))
         link = ET.SubElement(road, "link")
         points = ["end" if come_end else "start", "end" if go_end else "start"]
