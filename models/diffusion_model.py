@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,7 +23,7 @@ SCHEDULE_RULES: dict[str, Rule] = {
 }
 
 
-class DiffusionModel(ConfiguredModel):
+class DiffusionModel(ConfiguredModel, ABC):
     """A network that predicts the noise, or v, in latents (b, channels, size, size).
 
     Its config has the entries `schedule`, `prediction`, `label`, `num_labels`, `shift` and `scale`. Its buffer
@@ -32,15 +33,16 @@ class DiffusionModel(ConfiguredModel):
     noise_shares: Tensor
 
     @property
+    @abstractmethod
     def latent_shape(self) -> tuple[int, int, int]:
         """Shape (c, h, w) of a latent."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def num_mask_uniform(self) -> int:
         """Number of random numbers per sample of `make_known_masks`; 0 if the network reads no known part."""
-        raise NotImplementedError
 
+    @abstractmethod
     def make_known_masks(self, uniform: Tensor, values: Tensor) -> Tensor:
         """Make masks of random known parts for the training.
 
@@ -51,7 +53,6 @@ class DiffusionModel(ConfiguredModel):
         Returns:
             Masks with the shape of `values`; 1 marks values to generate, 0 marks known values.
         """
-        raise NotImplementedError
 
     @property
     def diffusion(self) -> Diffusion:

@@ -143,7 +143,7 @@ def evaluate_city(config: Config) -> dict:
         overviews = [
             Picture(result.city, result.overview, side) for side, found in by_side.items() for result in found[:SHOWN]
         ]
-        how = describe(config, dataset, label, by_side, count, reference_rows, has_map)
+        how = describe(config, dataset, label, by_side, town_m, count, reference_rows, has_map)
         storage.write_text(render_city_html(nested, rows, overviews, how), storage.join_uri(output, "city.html"))
         return nested
 
@@ -253,6 +253,7 @@ def describe(
     dataset: Dataset,
     label: Label,
     by_side: dict[str, list[CityResult]],
+    town_m: float,
     count: int,
     reference_rows: list[dict],
     has_map: bool,
@@ -267,8 +268,8 @@ def describe(
         f"Cities: {len(by_side[GENERATED])} scenes of run {config.run}.",
         f"Reference: {len(reference_rows)} scenes of {dataset.root}, split {config.real_split}, label"
         f" {format_label(label)}; crops at any place if the dataset has such crops.",
-        f"Ceiling: windows of {config.num_towns} procedural towns (version 2) with this label. They are selected by"
-        " their measured label, so their label fidelity is 1 and no ceiling.",
+        f"Ceiling: windows of {config.num_towns} procedural towns (version 2) of {town_m:g} m with this label. They are"
+        " selected by their measured label, so their label fidelity is 1 and no ceiling.",
         control,
         f"Each set of windows has {count} windows. Windows are moved vertically, so that the ground at their origin is"
         " as high as in the reference. Intervals treat windows as independent. They are too narrow, because windows of"

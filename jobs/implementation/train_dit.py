@@ -310,8 +310,14 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
                 "use equal values"
             )
     inherited = {"shift": built["shift"], "scale": built["scale"], "schedule": pipeline.dit.diffusion}
-    names = ["num_inference_steps", "noise_scaling", "existence_threshold"]
-    names += ["constraints", "pag_scale", "street_pag_factor"]
+    names = (
+        "num_inference_steps",
+        "noise_scaling",
+        "existence_threshold",
+        "constraints",
+        "pag_scale",
+        "street_pag_factor",
+    )
     sampling = {"scheduler": pipeline.scheduler_config} | {name: pipeline.config[name] for name in names}
     return Start(digest_weights(pipeline.dit), inherited, sampling, pipeline.dit.state_dict())
 

@@ -63,7 +63,7 @@ class TrainedInpainting:
             all streets are known, else 1.
 
     Raises:
-        ValueError: The guidance scale is out of range.
+        ValueError: The guidance scale or the factor is out of range.
     """
 
     num_inference_steps: int | None = None
@@ -76,6 +76,8 @@ class TrainedInpainting:
                 f"known_guidance_scale is {self.known_guidance_scale}, expected 0 to {MAX_GUIDANCE_SCALE:g}; 1 switches"
                 " the guidance off"
             )
+        if self.pag_factor is not None and not 0 <= self.pag_factor <= 1:
+            raise ValueError(f"pag_factor is {self.pag_factor}, expected 0 to 1")
 
     @property
     def num_evaluations(self) -> int:

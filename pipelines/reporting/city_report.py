@@ -101,21 +101,25 @@ def build_label_table(scores: Mapping[str, Any]) -> Table:
     rows = [
         (
             spell_name(name),
-            *(format_pair(sides["generated"][name], sides["reference"][name]) for sides in labels.values()),
+            *(
+                format_means(*(sides.get(side, {}).get(name) for side in ("generated", "reference", "ceiling")))
+                for sides in labels.values()
+            ),
         )
         for name in QUANTITIES
     ]
     note = (
-        "Each cell holds the mean over the windows with the label, and in brackets that of the reference. The streets"
-        " of the reference are cut at the border of each scene."
+        "Each cell holds the mean over the windows with the label, and in brackets those of the reference and of the"
+        " ceiling (–: no window of a town has the label). The streets of the reference are cut at the border of each"
+        " scene."
     )
     return Table("Quantities by label", ("quantity", *labels), rows, note=note)
 
 
-def format_pair(made: Mapping[str, float] | None, real: Mapping[str, float] | None) -> str:
-    """Return the values of two estimates as text, the second one in brackets."""
-    first, second = (format_number(found["value"]) if found else "–" for found in (made, real))
-    return f"{first} ({second})"
+def format_means(*estimates: Mapping[str, float] | None) -> str:
+    """Return the values of estimates as text; those after the first one are in brackets."""
+    first, *others = (format_number(found["value"]) if found else "–" for found in estimates)
+    return f"{first} ({', '.join(others)})"
 
 
 def build_street_table(scores: Mapping[str, Any]) -> Table:

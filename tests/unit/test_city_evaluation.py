@@ -120,10 +120,11 @@ def test_quantities_are_averaged_by_label():
     rows = {
         "generated": [row("low-low", 1.0), row("low-low", 3.0), row("high-any", 9.0)],
         "reference": [row("low-low", 5.0), row("low-high", 7.0)],
-        "ceiling": [row("low-low", 80.0, kept=False)],
+        "ceiling": [row("low-low", 80.0, kept=False), row("low-low", 4.0), row("high-high", 6.0)],
+        "control": [row("high-any", 50.0)],
     }
     scores = compute_label_scores(rows, ("generated", "reference"))
-    assert list(scores) == ["low-low"] and set(scores["low-low"]) == {"generated", "reference"}
+    assert list(scores) == ["low-low"] and set(scores["low-low"]) == {"generated", "reference", "ceiling"}
     written = {
         label: {
             side: {name: found and found._asdict() for name, found in estimates.items()}
@@ -134,7 +135,7 @@ def test_quantities_are_averaged_by_label():
     table = build_label_table({"labels": written})
     assert table.columns == ("quantity", "low-low")
     cells = dict(table.rows)
-    assert cells["vehicle small per ha"] == "2 (5)" and cells["road share"] == "0 (0)"
+    assert cells["vehicle small per ha"] == "2 (5, 4)" and cells["road share"] == "0 (0, 0)"
 
 
 def test_whole_cities_are_scored_by_blocks_traffic_and_seams():

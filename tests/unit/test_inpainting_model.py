@@ -169,6 +169,8 @@ def test_known_guidance_moves_samples_and_keeps_the_known_part(pipeline):
     assert torch.allclose(alone, pipeline.sample_latents(*arguments, 6), atol=1e-5)
     with pytest.raises(ValueError, match=r"known_guidance_scale is -1, expected 0 to 100"):
         TrainedInpainting(6, -1)
+    with pytest.raises(ValueError, match=r"pag_factor is 1\.5, expected 0 to 1"):
+        TrainedInpainting(6, pag_factor=1.5)
 
 
 def test_empty_known_part_is_ordinary_sampling(pipeline):
