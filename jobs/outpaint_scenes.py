@@ -50,8 +50,9 @@ class Config(RePaintOptions):
     overlap: float | None = None
     """Overlap of neighbouring blocks, as a share of the block size (default: 0.5 for outward, 0.25 for colours)."""
     order: Literal["outward", "colours"] | None = None
-    """Order of blocks: outward from the scene, as in the paper, or four groups of independent blocks (needs --overlap <
-    0.5; default: outward with at most one block per side, else colours, because outward drifts over long distances)."""
+    """Order of blocks: outward from the scene, as in the paper, or colours, four groups of independent blocks, which
+    need --overlap < 0.5 (default: outward with at most one block per side, else colours, because outward drifts over
+    long distances)."""
     margin: float | None = None
     """Width of the outermost part of a block that its neighbours generate again, as a share of the block size. It must
     be less than half of --overlap (default: 0.0625 if all streets are known from a plan or a map, else 0)."""
