@@ -48,6 +48,7 @@ INDEX_RULES: dict[str, Rule] = {
     "constraints": Flag(),
     "attach": Flag(),
     "pag_scale": Number(0, MAX_PAG_SCALE),
+    "pag_drops_label": Flag(),
     "street_pag_factor": Number(0, 1),
 }
 
@@ -88,6 +89,8 @@ class ConfiguredPipeline:
             not do this.
         pag_scale: Default scale of perturbed-attention guidance (`DiT.apply_modulations`) at noisy timesteps; 0
             switches it off, as in the paper.
+        pag_drops_label: Whether the second half of the perturbed network of this guidance has the null label, so the
+            guidance also raises the fidelity to labels.
         street_pag_factor: Factor of this scale for outpainted blocks that know all streets, from a plan or a map. Known
             streets support the attention, so the same scale adds too many small objects.
         street_planner: Network that plans the streets of large scenes (models/composition/street_plan.py); None: blocks
@@ -109,6 +112,7 @@ class ConfiguredPipeline:
         constraints: bool = False,
         attach: bool = True,
         pag_scale: float = 0.0,
+        pag_drops_label: bool = False,
         street_pag_factor: float = 1.0,
         num_inference_steps: int = NUM_INFERENCE_STEPS,
         street_planner: StreetPlanner | None = None,
@@ -128,6 +132,7 @@ class ConfiguredPipeline:
             constraints=constraints,
             attach=attach,
             pag_scale=pag_scale,
+            pag_drops_label=pag_drops_label,
             street_pag_factor=street_pag_factor,
         )
         self.execution = SamplingExecution()

@@ -327,7 +327,11 @@ class DiT(DiffusionModel):
 
     @torch.no_grad()
     def precompute_conditioning(
-        self, timesteps: Sequence[int], labels: Iterable[int], pag_scale: float = 0.0
+        self,
+        timesteps: Sequence[int],
+        labels: Iterable[int],
+        pag_scale: float = 0.0,
+        pag_drops_label: bool = False,
     ) -> Denoiser:
         """Precompute the modulations for timesteps and labels, and return a faster `forward` for them.
 
@@ -338,12 +342,14 @@ class DiT(DiffusionModel):
             timesteps: All timesteps that the denoiser will receive.
             labels: All class indices that the denoiser will receive, including the null label if guidance needs it.
             pag_scale: Scale of perturbed-attention guidance (`apply_modulations`); 0 switches it off.
+            pag_drops_label: Whether the perturbed network has the null label from the perturbed block on.
 
         Returns:
             A denoiser. The denoiser raises IndexError for other timesteps or labels.
         """
         timestep = torch.as_tensor(sorted(set(timesteps)), device=self.positions.device)
-        labels = sorted(set(labels))
+        drops = pag_drops_label and pag_scale != 0
+        labels = sorted({*labels, self.null_label} if drops else set(labels))
         # Compute each label separately. In a batch, the rounding could depend on the other labels.
         rows = [torch.cat(self.modulations(timestep, torch.full_like(timestep, label)), dim=1) for label in labels]
         table, sizes = torch.cat(rows), [*(layer.out_features for layer in self.list_modulations()), 2]
@@ -351,24 +357,35 @@ class DiT(DiffusionModel):
         for k, label in enumerate(labels):
             row_of[timestep, label] = torch.arange(len(timestep), device=timestep.device) + k * len(timestep)
 
+        def select(timestep: Tensor, label: Tensor | int) -> Sequence[Tensor]:
+            return table[row_of[timestep, label]].split(sizes, dim=1)
+
         def denoise(latent: Tensor, timestep: Tensor, label: Tensor) -> Tensor:
-            return self.apply_modulations(latent, table[row_of[timestep, label]].split(sizes, dim=1), pag_scale)
+            perturbed = select(timestep, self.null_label) if drops else None
+            return self.apply_modulations(latent, select(timestep, label), pag_scale, perturbed)
 
         return denoise
 
     def apply_modulations(
-        self, latent: Float[Tensor, "batch c_in h w"], modulations: Sequence[Tensor], pag_scale: float = 0.0
+        self,
+        latent: Float[Tensor, "batch c_in h w"],
+        modulations: Sequence[Tensor],
+        pag_scale: float = 0.0,
+        perturbed: Sequence[Tensor] | None = None,
     ) -> Float[Tensor, "batch c h w"]:
         """Predict the noise in latents with precomputed modulations.
 
         Perturbed-attention guidance (PAG; Ahn et al., ECCV 2024) extrapolates from the prediction of a perturbed
         network to that of the network. In the perturbed network, each token of the block depth // 2 (counted from 0)
-        attends only to itself. Both networks share the blocks before, so the guidance costs half an evaluation.
+        attends only to itself. Both networks share the blocks before, so the guidance costs half an evaluation. From
+        this block on, the perturbed network can have other modulations. With those of the null label, the guidance also
+        leads towards the label, like classifier-free guidance, at the same cost.
 
         Args:
             latent: Noisy latents, with or without a known part (see `forward`).
             modulations: Output of the method `modulations`.
             pag_scale: Scale of perturbed-attention guidance; 0 switches it off.
+            perturbed: Modulations of the perturbed network; None: the same modulations.
 
         Returns:
             Predicted noise.
@@ -384,19 +401,20 @@ class DiT(DiffusionModel):
                 raise ValueError("this transformer was trained without --inpainting, so it cannot read a known part")
             x = x + apply_in_float32(self.known_in, known).flatten(2).transpose(1, 2)
         *of_blocks, of_output, shares = modulations
-        for number, (block, modulation) in enumerate(zip(self.blocks, of_blocks, strict=True)):
+        *of_perturbed, perturbed_output, _ = modulations if perturbed is None else perturbed
+        for number, (block, own, other) in enumerate(zip(self.blocks, of_blocks, of_perturbed, strict=True)):
             if pag_scale and number == len(self.blocks) // 2:
-                x = torch.cat([block(x, modulation), block(x, modulation, perturb=True)])
+                x = torch.cat([block(x, own), block(x, other, perturb=True)])
             else:
-                x = block(x, modulation if len(modulation) == len(x) else modulation.repeat(2, 1))
+                x = block(x, own if len(own) == len(x) else torch.cat([own, other]))
         if pag_scale:
-            of_output = of_output.repeat(2, 1)
+            of_output = torch.cat([of_output, perturbed_output])
         shift, scale = of_output.chunk(2, dim=1)
         x = modulate(F.layer_norm(x, x.shape[-1:], eps=1e-6), shift, scale)
         x = apply_in_float32(self.patch_out, x)  # (b, n, p p c).
         if pag_scale:
-            x, perturbed = x.chunk(2)
-            x = x + pag_scale * (x - perturbed)
+            x, without = x.chunk(2)
+            x = x + pag_scale * (x - without)
         x = x.unflatten(1, (tokens, tokens)).unflatten(3, (patch, patch, -1))  # (b, i, j, p, q, c).
         x = x.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)
         if self.config.prediction == "epsilon":

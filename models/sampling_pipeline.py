@@ -226,10 +226,10 @@ class SamplingPipeline(ConfiguredPipeline):
                 f"guidance_scale is {guidance_scale}, expected 0 to {MAX_GUIDANCE_SCALE:g}; 1 switches the guidance off"
             )
         pag_scale = self.pag_scale if pag_scale is None else pag_scale
-        null = self.dit.null_label
+        null, drops = self.dit.null_label, self.config.pag_drops_label
         labels = {*label.tolist()} if guidance_scale == 1.0 else {*label.tolist(), null}
         weights = tuple((weight.data_ptr(), _get_version(weight)) for weight in self.dit.parameters())
-        key = tuple(sorted({*timesteps.tolist()})), guidance_scale, pag_scale, self.execution, weights
+        key = tuple(sorted({*timesteps.tolist()})), guidance_scale, pag_scale, drops, self.execution, weights
         if self._denoiser is not None and self._denoiser[0] == key:
             if labels <= self._denoiser[1]:
                 return self._denoiser[2]
@@ -238,7 +238,7 @@ class SamplingPipeline(ConfiguredPipeline):
 
         def build(steps: list[int], scale: float) -> Denoiser:
             with self.execution.autocast(self.device):
-                model = self.dit.precompute_conditioning(steps, labels, scale)
+                model = self.dit.precompute_conditioning(steps, labels, scale, drops)
             return self.execution.wrap(with_guidance(model, null, guidance_scale), self.device)
 
         start = PAG_START * self.diffusion.num_timesteps if pag_scale else float("inf")

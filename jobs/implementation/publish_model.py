@@ -52,6 +52,7 @@ def publish(config: Config) -> list[str]:
     as_judged = {"existence_threshold": about["sampling"].get("existence_threshold", EXISTENCE_THRESHOLD)}
     as_judged["constraints"] = about["sampling"].get("constraints", False)
     as_judged["pag_scale"] = about["sampling"].get("pag_scale", 0.0)
+    as_judged["pag_drops_label"] = about["sampling"].get("pag_drops_label", False)
     pipeline.use_sampler(about["sampling"]["sampler"])
     as_judged["num_inference_steps"] = about["sampling"]["num_inference_steps"]
     if about["sampling"]["sampler"] != "ddpm":

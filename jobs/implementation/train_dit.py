@@ -316,6 +316,7 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
         "existence_threshold",
         "constraints",
         "pag_scale",
+        "pag_drops_label",
         "street_pag_factor",
     )
     sampling = {"scheduler": pipeline.scheduler_config} | {name: pipeline.config[name] for name in names}

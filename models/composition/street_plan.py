@@ -2,8 +2,8 @@
 
 Blocks that do not know each other cannot agree on streets. A street planner (models/street_planner.py) generates signed
 distances (street_distances.py) over sections of 256 m. It continues known parts. The first section knows the streets of
-the given scene. Each further section knows those of its predecessors, which cover half of a section on the axes through
-the first section, and three quarters elsewhere. Blocks then take the plan as known ground, like a map of all roads.
+the given scene. Each further section knows those of its predecessors, which overlap it by a quarter of its side. Blocks
+then take the plan as known ground, like a map of all roads.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from models.scene import Grid, Scene
 from models.street_planner import CHANNELS, LABEL_KIND, PIXEL_M, StreetPlanner, measure_border_distances
 
 SAMPLER = "dpm++"
+SECTION_OVERLAP = 0.25  # Share of the side of a section that its neighbour also covers (docs/experiments/cities.md).
 SKETCH_RESOLUTION_M = 0.5  # Side of the pixels from which the distances of sketched roads are computed.
 LabelAt = Callable[[float, float], str]  # Maps x and y (m, frame of block (0, 0)) to the label of the block there.
 
@@ -83,7 +84,7 @@ class StreetPlan:
         self.planner, self.label_at, self.seed, self.scene_index = planner, label_at, seed, scene_index
         self.sketches = tuple(sketches)
         size = planner.config.size
-        self.section_grid = BlockGrid(size, size // 2, rank_outward, None)
+        self.section_grid = BlockGrid.from_overlap(size, SECTION_OVERLAP, rank=rank_outward, num_blocks=None)
         # First pixels of the first section, counted ahead from x = 0 and to the left from y = 0.
         self._first = -size // 2, -size // 2
         self._given, self._is_given = np.zeros((CHANNELS, size, size), np.float32), np.zeros((size, size), bool)

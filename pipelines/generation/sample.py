@@ -165,6 +165,8 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
     if "repaint" in options and "eta" not in options["repaint"]:
         options["sampler"] = pipeline.scheduler_config.class_name
         options["pag_scale"] = pipeline.pag_scale * options["repaint"].pop("pag_factor")
+    if options.get("pag_scale") and pipeline.config.pag_drops_label:
+        options["pag_drops_label"] = True
     guard_run(options.pop("output"), request.source, request.run, options, parts)
 
 

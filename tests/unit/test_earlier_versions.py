@@ -26,6 +26,7 @@ def test_pipeline_of_version_0_1_samples_same_latents():
         "constraints": False,
         "attach": True,
         "pag_scale": 0.0,
+        "pag_drops_label": False,
         "street_pag_factor": 1.0,
         "num_inference_steps": 250,
     }  # Current defaults.

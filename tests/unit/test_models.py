@@ -671,14 +671,20 @@ def test_pag_moves_noise_away_from_perturbed_network():
         return dit.precompute_conditioning(time.tolist(), label.tolist(), pag_scale)(latent, time, label)
 
     guided = {scale: predict(scale) for scale in (0.0, 1.0, 3.0)}
+    two = dit.precompute_conditioning(time.tolist(), label.tolist(), 2.0, pag_drops_label=True)(latent, time, label)
     assert torch.allclose(guided[0.0], plain, atol=1e-5)
     middle = dit.blocks[2]
     original, middle.forward = middle.forward, partial(middle.forward, perturb=True)
     perturbed = dit(latent, time, label)
+    null = dit.modulations(time, torch.full_like(label, dit.null_label))
+    mixed = [*dit.modulations(time, label)[:2], *null[2:]]  # The null label from the perturbed block on.
+    unlabelled = dit.apply_modulations(latent, mixed)
     middle.forward = original
     assert (perturbed - plain).abs().max() > 1e-3
     for scale in (1.0, 3.0):
         assert torch.allclose(guided[scale], plain + scale * (plain - perturbed), atol=1e-5)
+    assert torch.allclose(two, plain + 2 * (plain - unlabelled), atol=1e-5)
+    assert (unlabelled - perturbed).abs().max() > 1e-3
 
 
 def test_dit_unpatchify_inverts_patchify():

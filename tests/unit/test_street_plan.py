@@ -206,7 +206,7 @@ def test_plan_asks_for_the_label_of_each_place():
 
     plan = StreetPlan(tiny_planner(), make_street(), label_at, **FEW)
     plan.get_section((1, 0))
-    assert asked == [(32.0, 0.0), (96.0, 0.0)]
+    assert asked == [(32.0, 0.0), (128.0, 0.0)]
     assert convert_label("joint", "low-high") == "low-high-free" == convert_label("partial", "low-high")
     assert convert_label("vegetation", "low") == "low-any-free" and convert_label("none", "any") == "any-any-free"
 
