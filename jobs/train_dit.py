@@ -4,7 +4,7 @@
     jobs/train_dit.py                       the town preset on $PRITTI_HOME/datasets/town
     jobs/train_dit.py smoke                 seconds; generates its own data, layout VAE and latents
     jobs/train_dit.py kitti360-xl --dataset DIR --label-kind joint --num-workers 8
-    jobs/train_dit.py demo --start-from town --learning-rate 5e-4 --name more      continue with the released weights
+    jobs/train_dit.py town --start-from town --label-kind partial --learning-rate 4e-4      continue with the weights
 
 The job writes a complete pipeline to $PRITTI_HOME/models/pritti-<preset>. The job logs losses and sampled scenes to
 MLflow ($MLFLOW_TRACKING_URI, by default an sqlite file under $PRITTI_HOME). Run the same command again to resume.
