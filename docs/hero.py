@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from models import PrITTIPipeline
-from models.sampling.repaint import RePaintConfig
 from models.scene import Scene
 from pipelines.geometry.centerlines import extract_road_network, plan_drive
 from pipelines.rendering.pinhole import Lens, StreetRenderer, shade_view
@@ -45,7 +44,7 @@ def main() -> None:
     made = {}
     for label in ("low-high", "medium-medium", "high-low"):
         made[label] = pipeline.generate([label], seed=SEED)[0]
-    larger = pipeline.outpaint(made["medium-medium"], "medium-medium", seed=SEED, repaint=RePaintConfig.guided())
+    larger = pipeline.outpaint(made["medium-medium"], "medium-medium", seed=SEED)
     above = stack_pictures([render_3d(scene, WIDTH, HEIGHT) for scene in made.values()], 1)
     views = stack_pictures(draw_street_views(larger), 0)
     below = stack_pictures([render_3d(larger, 2 * WIDTH + GAP, len(views)), views], 1)

@@ -51,6 +51,10 @@ class Config:
     start_from: str = ""
     """Initialise with the weights of this pipeline; all values that --model of other jobs accepts are valid (default:
     random weights)."""
+    average_with: str = ""
+    """Return the mean of the trained weights and those of this pipeline, which has the same layout VAE and size. If the
+    training continued these weights, the mean often keeps more of their abilities (Wortsman et al., CVPR 2022;
+    default: the trained weights)."""
     steps: int | None = None
     """Number of training steps (default: as in the preset)."""
     batch_size: int | None = None

@@ -78,8 +78,11 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     architecture = make_dit_architecture(row, latents, load_encoder(latents, latents_root), label_kind)
     start = load_start(config.start_from, latents["lvae_digest"], architecture) if config.start_from else None
     architecture |= start.inherited if start else {}
+    other = load_other(config.average_with, latents["lvae_digest"], architecture) if config.average_with else None
     settings = make_optimizer_config(config, row)
     identity = make_run_identity(config, row, settings, latents, root, start) | {"label": label_kind}
+    if other:
+        identity |= {"average_with": other.digest}
     name = find_run_name(config)
     record = trainer.guard_run_name(name, home_path("runs"), identity)
     tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
@@ -90,6 +93,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     check_training_labels(shards, label_kind)
     training = TrainingRun(
         name=name,
+        average_with=other.state if other else None,
         round_weights=config.round_weights,
         storage_path=home_path("runs"),
         build=partial(build, architecture, settings, execution, row.label_dropout, start, loss_config),
@@ -286,8 +290,24 @@ class Start:
     state: dict[str, Tensor]
 
 
-def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
-    """Return the transformer of a trained pipeline.
+def load_other(model: str, lvae_digest: str, architecture: dict) -> Start:
+    """Return the transformer of --average-with.
+
+    Raises:
+        ValueError: See `load_start`; or the transformers read latents of different scales.
+    """
+    other = load_start(model, lvae_digest, architecture, "--average-with")
+    for key in ("shift", "scale"):
+        if architecture[key] != other.inherited[key]:
+            raise ValueError(
+                f"--average-with {model}: its latents have another {key}; use --start-from {model}, or a pipeline whose"
+                " training started from it"
+            )
+    return other
+
+
+def load_start(model: str, lvae_digest: str, architecture: dict, option: str = "--start-from") -> Start:
+    """Return the transformer of a trained pipeline; error messages name the option.
 
     Raises:
         ValueError: The transformer was trained on latents of another layout VAE, or its architecture differs.
@@ -296,17 +316,17 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
     pipeline = load_pipeline(directory)
     if digest_weights(pipeline.lvae) != lvae_digest:
         raise ValueError(
-            f"--start-from {model}: its transformer was trained on latents of another layout VAE; "
+            f"{option} {model}: its transformer was trained on latents of another layout VAE; "
             "encode latents with that layout VAE first: jobs/encode_latents.py --lvae "
             f"{storage.join_uri(directory, 'lvae')}"
         )
     built = pipeline.dit.config
     if built["inpainting"] and not architecture["inpainting"]:
-        raise ValueError(f"--start-from {model} is an inpainting model; add --inpainting")
+        raise ValueError(f"{option} {model} is an inpainting model; add --inpainting")
     for key in ("patch", "depth", "width", "heads", "prediction", "label"):
         if built[key] != architecture[key]:
             raise ValueError(
-                f"--start-from {model}: its {key} is {built[key]}, but that of this run is {architecture[key]}; "
+                f"{option} {model}: its {key} is {built[key]}, but that of this run is {architecture[key]}; "
                 "use equal values"
             )
     inherited = {"shift": built["shift"], "scale": built["scale"], "schedule": pipeline.dit.diffusion}

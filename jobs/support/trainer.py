@@ -10,7 +10,7 @@ import logging
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
@@ -53,7 +53,8 @@ class TrainingRun:
     The function `build(device, wrap)` returns the Trainer. The function `validate(trainer)` returns metrics and
     pictures (arrays by name); it runs on rank 0 at every checkpoint. The field `identity` holds the options that must
     not change when a run is resumed. Error messages name samples by `id_column`, a table and a column. With
-    `round_weights`, weights of results are rounded to float16; training itself does not change.
+    `average_with`, results have the mean of the trained weights and these weights. With `round_weights`, weights of
+    results are rounded to float16. Neither changes the training itself.
     """
 
     name: str
@@ -67,6 +68,7 @@ class TrainingRun:
     checkpoint_every: int
     log_every: int
     validate: Callable[[Trainer], tuple[dict[str, float], dict[str, np.ndarray]]] | None = None
+    average_with: Mapping[str, torch.Tensor] | None = None
     round_weights: bool = False
     id_column: tuple[str, str] = ("scenes", "scene_id")
 
@@ -237,7 +239,7 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
             run.tracker.metrics(values, trainer.steps_done)
         for name, image in pictures.items():
             run.tracker.picture(image, f"{name}/step-{trainer.steps_done:07d}.png")
-    model = make_result(trainer, run.round_weights)
+    model = make_result(trainer, run.average_with, run.round_weights)
     tag_weights(run.tracker, model, trainer.steps_done)
     with tempfile.TemporaryDirectory() as directory:
         trainer.save(directory)
@@ -245,11 +247,18 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
         ray.train.report(metrics, checkpoint=Checkpoint.from_directory(directory))
 
 
-def make_result(trainer: Trainer, round_weights: bool) -> ConfiguredModel:
-    """Return the model that a run saves: with EMA weights if EMA is enabled, and rounded on request."""
+def make_result(
+    trainer: Trainer, average_with: Mapping[str, torch.Tensor] | None, round_weights: bool
+) -> ConfiguredModel:
+    """Return the model that a run saves: with EMA weights if EMA is enabled, averaged and rounded on request."""
     model = trainer.ema_model()
+    if average_with is None and not round_weights:
+        return model
+    model = copy.deepcopy(model)  # Without moving average, this is the model that is trained.
+    own = model.state_dict()
+    for name, value in (average_with or {}).items():  # The other weights may lack the layer for known parts.
+        own[name].lerp_(value.to(own[name]), 0.5)
     if round_weights:
-        model = copy.deepcopy(model)  # Without moving average, this is the model that is trained.
         model.round_to_float16()
     return model
 

@@ -179,6 +179,10 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
         prepare(Config(preset="smoke", name="other", start_from=start, label_kind="vehicle"))
     with pytest.raises(ValueError, match=r"--start-from town: .* another layout VAE"):
         prepare(Config(preset="smoke", name="other", start_from="town"))
+    with pytest.raises(ValueError, match=r"--average-with town: .* another layout VAE"):
+        prepare(Config(preset="smoke", name="other", average_with="town"))
+    averaged = prepare(Config(preset="smoke", name="mean", start_from=start, average_with=start))[0]
+    assert averaged.identity["average_with"] == averaged.identity["start_from"]
 
 
 def test_pipeline_directory_rejects_unknown_model(smoke, tmp_path):

@@ -236,12 +236,29 @@ def test_rounding_of_result_does_not_change_training(ema_decay):
     settings = OptimizerConfig(8, 1e-3, 0.0, ema_decay=ema_decay)
     trainer = make_dit_trainer(DiT(channels=4, size=8, width=32, depth=1, heads=2), settings, 0.1, torch.device("cpu"))
     before = {name: value.clone() for name, value in trainer.model.state_dict().items()}
-    result = make_result(trainer, round_weights=True).state_dict()
+    result = make_result(trainer, None, round_weights=True).state_dict()
     assert all(torch.equal(value, before[name]) for name, value in trainer.model.state_dict().items())
     assert all(torch.equal(value, before[name].half().float()) for name, value in result.items())
     assert not all(torch.equal(value, before[name]) for name, value in result.items())
-    plain = make_result(trainer, round_weights=False).state_dict()
+    plain = make_result(trainer, None, round_weights=False).state_dict()
     assert all(torch.equal(value, before[name]) for name, value in plain.items())
+
+
+def test_result_is_the_mean_with_other_weights():
+    from jobs.support.trainer import make_result
+
+    sizes = {"channels": 4, "size": 8, "width": 32, "depth": 1, "heads": 2}
+    trainer = make_dit_trainer(
+        DiT(inpainting=True, **sizes), OptimizerConfig(8, 1e-3, 0.0, ema_decay=None), 0.1, torch.device("cpu")
+    )
+    other = DiT(**sizes).state_dict()
+    trained = {name: value.clone() for name, value in trainer.model.state_dict().items()}
+    result = make_result(trainer, other, round_weights=False).state_dict()
+    assert set(result) - set(other) == {"known_in.weight"}
+    for name, value in result.items():
+        wanted = (trained[name] + other[name]) / 2 if name in other else trained[name]
+        assert torch.allclose(value, wanted, atol=1e-7), name
+    assert all(torch.equal(value, trained[name]) for name, value in trainer.model.state_dict().items())
 
 
 def test_train_lvae_with_two_workers_matches_one(home):
