@@ -44,7 +44,7 @@ def main() -> None:
     made = {}
     for label in ("low-high", "medium-medium", "high-low"):
         made[label] = pipeline.generate([label], seed=SEED)[0]
-    larger = pipeline.outpaint(made["medium-medium"], "medium-medium", seed=SEED)
+    larger = pipeline.outpaint(made["medium-medium"], "medium-medium", seed=SEED, free_blocks="all", plan_streets=True)
     above = stack_pictures([render_3d(scene, WIDTH, HEIGHT) for scene in made.values()], 1)
     views = stack_pictures(draw_street_views(larger), 0)
     below = stack_pictures([render_3d(larger, 2 * WIDTH + GAP, len(views)), views], 1)

@@ -176,7 +176,7 @@ def test_pipeline_attaches_by_default():
     pipeline.set_progress_bar_config(disable=True)
     pipeline.use_sampler("dpm++")
     labels = ["low-low", "medium-medium", "high-low", "low-high"]
-    latents = pipeline.sample_latents(labels, 0, range(4), 10)
+    latents = pipeline.sample_latents(labels, 2, range(4), 10)
     identities = [pipeline.new_identity("run", 0, k, label) for k, label in enumerate(labels)]
     plain = pipeline.decode(latents, identities, attach=False)
     assert pipeline.attachments == AttachmentReport()
