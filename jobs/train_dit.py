@@ -53,8 +53,8 @@ class Config:
     random weights)."""
     average_with: str = ""
     """Return the mean of the trained weights and those of this pipeline, which has the same layout VAE and size. If the
-    training continued these weights, the mean often keeps more of their abilities (Wortsman et al., CVPR 2022;
-    default: the trained weights)."""
+    training continued these weights, the mean often keeps more of their abilities (Wortsman et al., CVPR 2022). The
+    logged scenes are those of the trained weights (default: the trained weights)."""
     steps: int | None = None
     """Number of training steps (default: as in the preset)."""
     batch_size: int | None = None

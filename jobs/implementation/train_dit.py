@@ -37,6 +37,7 @@ from models.labels import LABELS, list_usual_labels
 from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTPreset, find_preset
+from models.sampling.diffusion import PAPER_SCHEDULE
 from models.training import (
     DiffusionLossConfig,
     ExecutionConfig,
@@ -294,14 +295,15 @@ def load_other(model: str, lvae_digest: str, architecture: dict) -> Start:
     """Return the transformer of --average-with.
 
     Raises:
-        ValueError: See `load_start`; or the transformers read latents of different scales.
+        ValueError: See `load_start`; or the shift or the scale of the latents, or the noise schedule, differs.
     """
     other = load_start(model, lvae_digest, architecture, "--average-with")
-    for key in ("shift", "scale"):
-        if architecture[key] != other.inherited[key]:
+    own = {"schedule": PAPER_SCHEDULE} | architecture
+    for key, value in other.inherited.items():
+        if own[key] != value:
             raise ValueError(
-                f"--average-with {model}: its latents have another {key}; use --start-from {model}, or a pipeline whose"
-                " training started from it"
+                f"--average-with {model}: its {key} differs; use --start-from {model}, or a pipeline whose training"
+                " started from it"
             )
     return other
 

@@ -429,6 +429,22 @@ def test_run_guard_keeps_noise_scaling_of_guided_run(smoke, tmp_path):
         guard_generation_run(request, pipeline, [str(smoke)])
 
 
+def test_run_guard_keeps_how_pag_treats_labels(smoke, tmp_path):
+    from pipelines.generation.sample import SampleRequest, guard_generation_run, load_pipeline
+
+    model = str(smoke / "models/pritti-smoke")
+    pipeline = load_pipeline(model)
+    for run, pag_scale in (("plain", 0.0), ("pag", 2.0)):
+        request = SampleRequest(model, str(tmp_path), run, 1, ("low",), 0, 5, 1.0, pag_scale=pag_scale)
+        for drops in (False, True):
+            pipeline.register_to_config(pag_drops_label=drops)
+            if drops and pag_scale:
+                with pytest.raises(ValueError, match="holds a run 'pag' with pag_drops_label"):
+                    guard_generation_run(request, pipeline, [str(smoke)])
+            else:
+                guard_generation_run(request, pipeline, [str(smoke)])
+
+
 def test_evaluate_real_against_itself_is_near_perfect(smoke, tmp_path):
     """The evaluator compares training scenes with the same scenes, so the scores show its noise floor."""
     from pipelines.evaluation.evaluate import compare_datasets

@@ -171,6 +171,12 @@ def test_pipeline_stores_pag_scale_and_guides_noisy_timesteps(tmp_path):
         noises[scale] = [denoise(latent, torch.full((2,), timestep), label) for timestep in (900, 200, 199, 5)]
     alike = [torch.allclose(*pair, atol=1e-5) for pair in zip(*noises.values(), strict=True)]
     assert alike == [False, False, True, True]
+    loaded.use_pag(2.0)
+    loaded.register_to_config(pag_drops_label=True)
+    denoise = loaded.make_denoiser(torch.tensor([900, 200, 199, 5]), label)
+    dropped = [denoise(latent, torch.full((2,), timestep), label) for timestep in (900, 200, 199, 5)]
+    alike = [torch.allclose(*pair, atol=1e-5) for pair in zip(dropped, noises[2.0], strict=True)]
+    assert alike == [False, False, True, True]
     found = []
     known = InpaintCondition(torch.zeros(1, *loaded.latent_shape), torch.ones(1, *loaded.latent_shape))
     for scale in (2.0, 0.0):
