@@ -70,6 +70,8 @@ class SceneOptions:
     """Read only scenes of this source (default: all sources)."""
     split: str = ""
     """Read only scenes of this split (default: all splits)."""
+    scene_ids: tuple[str, ...] = ()
+    """Read only the scenes with these ids; --max-scenes then has no effect (default: the first scenes)."""
     max_scenes: int | None = None
     """Maximum number of scenes; the first scenes are used (default: all)."""
 

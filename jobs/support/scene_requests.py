@@ -15,7 +15,10 @@ from pipelines.schema.scene_subset import SceneSubset
 def select_scenes(options: SceneOptions) -> SceneSubset:
     """Return the subset of scenes that the options select."""
     directory = resolve_path(options.input, "generated")
-    return SceneSubset(directory, options.source or None, options.split or None, options.max_scenes, "first")
+    limit = None if options.scene_ids else options.max_scenes
+    return SceneSubset(
+        directory, options.source or None, options.split or None, limit, "first", ids=tuple(options.scene_ids)
+    )
 
 
 def make_execution(options: RePaintOptions) -> SamplingExecution:

@@ -72,7 +72,7 @@ class EditRequest:
             "source": selection.source,
             "split": selection.split,
             "limit": selection.limit,
-        }
+        } | ({"ids": selection.ids} if selection.ids else {})
         guard_run(self.output, self.source, self.run, {"edits": serialize_edits(self.edits)} | chosen)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import numpy as np
@@ -300,7 +300,7 @@ def inpaint_scenes(
         request,
         pipeline,
         [storage.join_uri(request.output, "drift", request.run)],
-        input=asdict(selection),
+        input=selection.to_record(),
         scenes=selection.files(),
     )
 

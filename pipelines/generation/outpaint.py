@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -547,7 +547,7 @@ def outpaint_scenes(
     )
     block_grid = request.make_block_grid(pipeline.latent_shape[-1])
     parts = [storage.join_uri(request.output, "blocks", request.run)]
-    guard_generation_run(request, pipeline, parts, input=asdict(selection), scenes=selection.files())
+    guard_generation_run(request, pipeline, parts, input=selection.to_record(), scenes=selection.files())
 
     for shard, row in chosen if request.roads else []:
         scene = resample_to_model_grid(shard.scenes([row])[0], pipeline.spec)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from difflib import get_close_matches
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -44,6 +45,7 @@ class SceneSubset:
         pick: Selection rule.
         apart_m: Minimum distance between poses for the rule "apart" (m).
         half: Select only from the "first" or the "second" half of the places; "" means all (`split_halves`).
+        ids: Select only the scenes with these ids, in the order of the tables; empty means all.
     """
 
     root: str
@@ -53,6 +55,7 @@ class SceneSubset:
     pick: Pick | str = "spread"
     apart_m: float = 0.0
     half: Half | str = ""
+    ids: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.limit is not None and self.limit < 1:
@@ -71,7 +74,7 @@ class SceneSubset:
             Shards in order, with the selected row numbers of each shard in ascending order.
 
         Raises:
-            ValueError: The dataset directory holds no matching scene.
+            ValueError: The dataset directory holds no matching scene, or no scene with one of the ids.
         """
         return self._shards
 
@@ -82,6 +85,13 @@ class SceneSubset:
         """
         prints = storage.fingerprint_files([shard.path("scenes") for shard, _ in self._shards])
         return [[*found, rows] for found, (_, rows) in zip(prints, self._shards, strict=True)]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the attributes by name, without `ids` if it is empty.
+
+        Records of runs of earlier versions have no ids.
+        """
+        return {name: value for name, value in asdict(self).items() if name != "ids" or value}
 
     def fingerprint(self) -> str:
         """Return the first sixteen hexadecimal digits of the SHA-256 digest of `files`."""
@@ -94,11 +104,24 @@ class SceneSubset:
         worlds = [shard.source for shard in shards]
         counts = np.array([len(table) for table in tables])
         starts = np.cumsum(counts) - counts
-        chosen = np.sort(self.chosen(pa.concat_tables(tables), np.repeat(worlds, counts)))
+        found = self._find_ids(shards) if self.ids else np.arange(counts.sum())
+        chosen = found[np.sort(self.chosen(pa.concat_tables(tables).take(found), np.repeat(worlds, counts)[found]))]
         if not len(chosen):
             raise ValueError(f"{self.root}: the shards of {self.source or 'all sources'} hold no scene")
         rows = [chosen[(chosen >= s) & (chosen < s + n)] - s for s, n in zip(starts, counts, strict=True)]
         return [(shard, r.tolist()) for shard, r in zip(shards, rows, strict=True) if len(r)]
+
+    def _find_ids(self, shards: list[Shard]) -> np.ndarray:
+        """Return the row numbers of the scenes with the ids, counted over all shards, in ascending order."""
+        known = np.concatenate([shard.read("scenes", ["scene_id"])["scene_id"].to_numpy() for shard in shards])
+        for wanted in self.ids:
+            if wanted not in known:
+                alike = [name for name in known if wanted in name] or get_close_matches(wanted, known) or known
+                raise ValueError(
+                    f"{self.root}: no scene {wanted!r} among {len(known)} scenes; existing scenes include"
+                    f" {', '.join(alike[:3])}"
+                )
+        return np.flatnonzero(np.isin(known, self.ids))
 
     def chosen(self, scenes: pa.Table, source: np.ndarray) -> np.ndarray:
         """Select rows of a table of all scenes.
