@@ -25,12 +25,12 @@ from pipelines.evaluation.cities import (
     CityResult,
     Label,
     RunRecord,
+    choose_rings_per_group,
     compute_label_scores,
     compute_quantity_scores,
     compute_whole_scores,
     format_label,
     measure_cities,
-    name_group,
     name_source,
     parse_label,
     read_run_record,
@@ -58,7 +58,7 @@ SHOWN = 2  # Number of overviews per side.
 
 def evaluate_city(config: Config) -> dict:
     """Measure and score all windows, write all files, and return the content of metrics.json."""
-    require_positive(config, "num_reference", "num_towns", "num_actors")
+    require_positive(config, "num_reference", "num_towns", "num_actors", "rings_per_group")
     if config.num_towns < 2:
         raise ValueError(f"--num-towns is {config.num_towns}, expected at least 2: towns are compared with each other")
     generated = resolve_path(config.generated, "outpainted")
@@ -85,6 +85,7 @@ def evaluate_city(config: Config) -> dict:
             f"a city of run {config.run} has a side of {extent_m:g} m, expected at least {MIN_EXTENT_M:g} m, which hold"
             " rings 0 and 1; use outpaint_scenes.py --extent-m"
         )
+    rings_per_group = config.rings_per_group or choose_rings_per_group(extent_m)
     jobs = [
         CityRequest(
             side,
@@ -95,13 +96,22 @@ def evaluate_city(config: Config) -> dict:
             traffic=traffic,
             label=label,
             block_labels=records[side].block_labels,
+            rings_per_group=rings_per_group,
         )
         for side, listed in cities.items()
         for number, city in enumerate(listed)
     ]
     town_m = min(extent_m, MAX_TOWN_EXTENT_M)
     jobs += [
-        CityRequest(CEILING, k, town_seed=TOWN_SEEDS_START + k, extent_m=town_m, traffic=traffic, label=label)
+        CityRequest(
+            CEILING,
+            k,
+            town_seed=TOWN_SEEDS_START + k,
+            extent_m=town_m,
+            traffic=traffic,
+            label=label,
+            rings_per_group=rings_per_group,
+        )
         for k in range(config.num_towns)
     ]
     with hold_output(output, "evaluation", config):
@@ -208,11 +218,10 @@ def score_rings(
         Scores by side and group of rings, and the number of windows of each compared set.
     """
     sets = {
-        (side, group): SceneSubset(root, name_source(side, ring), SPLIT)
+        (side, group): SceneSubset(root, name_source(side, group), SPLIT)
         for side in rows
         if side not in (REFERENCE, CEILING)
-        for ring in sorted({row["ring"] for row in rows[side]})
-        for group in [name_group(ring)]
+        for group in dict.fromkeys(row["group"] for row in sorted(rows[side], key=lambda row: row["ring"]))
     }
     sets[CEILING, "all"] = SceneSubset(root, CEILING, SPLIT)
     counts = {key: count_scenes(subset) for key, subset in sets.items()}

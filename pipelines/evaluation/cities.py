@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import ceil
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,6 +46,7 @@ from pipelines.schema.tables import Shard
 
 CENTER_M = (WINDOW_M / 2, 0.0)  # Centre of the first scene of a city, in the frame of the city.
 SPLIT = "windows"
+MAX_GROUPS = 5  # Groups of rings of a city.
 FINE_CELLS = 1024  # Cells per block for locating seams: records do not hold the latent size, which is smaller.
 OVERVIEW_PX = 768
 REFERENCE, CEILING = "reference", "ceiling"
@@ -59,12 +61,12 @@ class CityResult:
     Attributes:
         side: Name of the set to which the city belongs.
         city: Scene id.
-        rows: One dictionary per window: ahead, left, ring, direction, kept, label and QUANTITIES.
+        rows: One dictionary per window: ahead, left, ring, group, direction, kept, label and QUANTITIES.
         angles_m: (n, 18) length of centrelines by direction, per window (m).
         city_blocks_m2: Areas of the city blocks (m^2).
         connectivity: Share of road pixels in the largest connected part.
         area_m2: Area of the city (m^2).
-        seams: Record (4, 2, 2) of the seams of each ring; empty if no seams are known.
+        seams: Record (4, 2, 2) of the seams of each group of rings; empty if no seams are known.
         overview: (h, w, 3) uint8 picture of the city from above.
         traffic: Result of a simulation of traffic; None without simulation or without roads.
     """
@@ -76,7 +78,7 @@ class CityResult:
     city_blocks_m2: np.ndarray
     connectivity: float
     area_m2: float
-    seams: dict[int, np.ndarray]
+    seams: dict[str, np.ndarray]
     overview: np.ndarray
     traffic: Traffic | None
 
@@ -126,6 +128,7 @@ class CityRequest:
         label: Requested densities of vegetation and vehicles; None: any. Windows of a procedural town are kept only if
             they have these densities.
         block_labels: Labels of the blocks; each window has the label of the nearest block. None: all have `label`.
+        rings_per_group: Number of rings per group (`name_group`).
     """
 
     side: str
@@ -138,6 +141,7 @@ class CityRequest:
     traffic: bool = False
     label: Label = (None, None)
     block_labels: BlockLabels | None = None
+    rings_per_group: int = 1
 
 
 def find_seams_m(block_grid: BlockGrid, cell_m: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -257,7 +261,7 @@ def find_origin_level_m(scene: Scene) -> float:
 def measure_city_windows(
     job: CityRequest, root: str, dataset: Dataset, level_m: float, resolution_m: float
 ) -> CityResult:
-    """Measure one city, and write its windows to a dataset directory, one source per ring.
+    """Measure one city, and write its windows to a dataset directory, one source per group of rings.
 
     Args:
         job: City.
@@ -297,12 +301,13 @@ def measure_city_windows(
             vehicle_density=vehicle,
             world_xyz_m=(x_m + place[0], y_m + place[1], z_m),
         )
-        rows.append(_make_row(job.side, city, window, values, (vegetation, vehicle), kept))
+        group = name_group(window.ring, job.rings_per_group)
+        rows.append(_make_row(job.side, city, window, values, (vegetation, vehicle), group, kept))
         if kept:
-            windows.setdefault(name_source(job.side, window.ring), []).append(scene)
+            windows.setdefault(name_source(job.side, group), []).append(scene)
     for source, scenes in windows.items():
         Shard(root, source, SPLIT, job.number).write([replace(s, source=source, split=SPLIT) for s in scenes])
-    seams = {}
+    seams: dict[str, np.ndarray] = {}
     if any(job.seams_m):
         grid = city.grid
         lines = (
@@ -311,7 +316,9 @@ def measure_city_windows(
                 (grid.front_m, grid.left_m), (grid.rows, grid.cols), job.seams_m, strict=True
             )
         )
-        seams = measure_seams_by_ring(city, *lines, center_m=CENTER_M)
+        for ring, record in measure_seams_by_ring(city, *lines, center_m=CENTER_M).items():
+            group = name_group(ring, job.rings_per_group)
+            seams[group] = seams.get(group, 0) + record
     area_m2 = city.grid.rows * city.grid.cols * city.grid.resolution_m**2
     return CityResult(
         job.side,
@@ -333,7 +340,7 @@ def format_label(label: Label) -> str:
 
 
 def _make_row(
-    side: str, city: Scene, window: Window, values: np.ndarray, label: Label, kept: bool = True
+    side: str, city: Scene, window: Window, values: np.ndarray, label: Label, group: str, kept: bool = True
 ) -> dict[str, Any]:
     """Return the row of a window in windows.parquet."""
     return {
@@ -342,20 +349,45 @@ def _make_row(
         "ahead": window.ahead,
         "left": window.left,
         "ring": window.ring,
+        "group": group,
         "direction": window.direction,
         "kept": kept,
         "label": format_label(label),
     } | dict(zip(QUANTITIES, values.tolist(), strict=True))
 
 
-def name_group(ring: int) -> str:
-    """Return the name of the group of rings with a ring: rings 0 and 1 have few windows and form one group."""
-    return "0-1" if ring < 2 else str(ring)
+def name_group(ring: int, rings_per_group: int = 1) -> str:
+    """Return the name of the group of rings to which a ring belongs.
+
+    Ring 0 is a single window and belongs to the first group.
+
+    Args:
+        ring: Number of the ring.
+        rings_per_group: Number of rings per group, in the first group without ring 0.
+
+    Returns:
+        First and last ring of the group, such as 0-1, 2 or 4-6.
+    """
+    number = max(ring - 1, 0) // rings_per_group
+    first, last = number * rings_per_group + (number > 0), (number + 1) * rings_per_group
+    return str(first) if first == last else f"{first}-{last}"
 
 
-def name_source(side: str, ring: int) -> str:
-    """Return the source of the windows of a ring; those of the ceiling have no centre and thus one source."""
-    return side if side == CEILING else f"{side}-ring-{name_group(ring)}"
+def choose_rings_per_group(extent_m: float) -> int:
+    """Return the number of rings per group, so that a report has at most MAX_GROUPS groups.
+
+    Args:
+        extent_m: Side of the city (m).
+
+    Returns:
+        Number of rings per group, at least 1.
+    """
+    return max(1, ceil((extent_m / 2 - WINDOW_M / 2) // WINDOW_M / MAX_GROUPS))
+
+
+def name_source(side: str, group: str) -> str:
+    """Return the source of the windows of a group of rings; the ceiling has no centre and thus one source."""
+    return side if side == CEILING else f"{side}-ring-{group}"
 
 
 def measure_reference_part(
@@ -391,7 +423,7 @@ def measure_reference_part(
         scenes.append(scene)
         measured = measure_city(scene, CENTER_M)
         label = scene.vegetation_density, scene.vehicle_density
-        rows.append(_make_row(REFERENCE, scene, measured.windows[0], measured.quantities[0], label))
+        rows.append(_make_row(REFERENCE, scene, measured.windows[0], measured.quantities[0], label, name_group(0)))
     Shard(root, REFERENCE, SPLIT, number).write([replace(s, source=REFERENCE, split=SPLIT) for s in scenes])
     return rows, [find_origin_level_m(scene) for scene in scenes]
 
@@ -495,7 +527,7 @@ def compute_quantity_scores(rows: Sequence[dict]) -> dict[str, dict[str, Estimat
     kept = [row for row in rows if row["kept"]]
     groups: dict[str, list[dict]] = {}
     for row in sorted(kept, key=lambda row: row["ring"]):
-        groups.setdefault(name_group(row["ring"]), []).append(row)
+        groups.setdefault(row["group"], []).append(row)
     groups["all"] = kept
     return {group: _estimate_quantities(chosen) for group, chosen in groups.items() if chosen}
 
@@ -554,9 +586,9 @@ def compute_whole_scores(results: Sequence[CityResult], towns: Sequence[CityResu
     towns_m = np.array([town.angles_m.sum(axis=0) for town in towns])
     distances: dict[str, Any] = {}
     seams: dict[str, Any] = {}
-    groups = dict.fromkeys(name_group(row["ring"]) for result in results for row in result.rows)
-    for group in (*groups, "all"):
-        of_group = [[group in (name_group(row["ring"]), "all") for row in result.rows] for result in results]
+    rows = sorted((row for result in results for row in result.rows), key=lambda row: row["ring"])
+    for group in (*dict.fromkeys(row["group"] for row in rows), "all"):
+        of_group = [[group in (row["group"], "all") for row in result.rows] for result in results]
         angles_m = np.array([r.angles_m[mask].sum(axis=0) for r, mask in zip(results, of_group, strict=True)])
         found = compute_street_distances(angles_m, towns_m)
         same = [[result.city == town.city for town in towns] for result in results]
@@ -571,7 +603,7 @@ def compute_whole_scores(results: Sequence[CityResult], towns: Sequence[CityResu
         distances[group] = compute_scene_means(per_city[:, None])[0]
         records = [
             sum(
-                (record for ring, record in result.seams.items() if group in (name_group(ring), "all")),
+                (record for name, record in result.seams.items() if group in (name, "all")),
                 np.zeros(SEAM_RECORD_SHAPE),
             )
             for result in results

@@ -10,12 +10,14 @@ from models.composition.block_grid import RANKS, BlockGrid, label_blocks
 from models.scene import VEGETATION, VEHICLES
 from pipelines.evaluation.cities import (
     CityResult,
+    choose_rings_per_group,
     compute_label_scores,
     compute_quantity_scores,
     compute_street_distances,
     compute_whole_scores,
     find_origin_level_m,
     find_seams_m,
+    name_group,
     name_source,
     parse_label,
     read_run_record,
@@ -72,13 +74,13 @@ def test_windows_have_the_label_of_the_nearest_block(tmp_path):
     assert find(64, 64) == find(500, 500) == ("low", "low") and find(-64, -64) == ("high", "high")
 
 
-def test_windows_of_the_first_rings_share_a_source():
-    assert [name_source("generated", ring) for ring in (0, 1, 2)] == [
-        "generated-ring-0-1",
-        "generated-ring-0-1",
-        "generated-ring-2",
-    ]
-    assert {name_source("ceiling", ring) for ring in range(4)} == {"ceiling"}
+def test_rings_form_groups_of_equal_width():
+    assert [name_group(ring) for ring in range(4)] == ["0-1", "0-1", "2", "3"]
+    assert [name_group(ring, 3) for ring in range(8)] == ["0-3"] * 4 + ["4-6"] * 3 + ["7-9"]
+    # 192 m: ring 1; 704 m: five rings; 768 m: still five whole rings; 832 m: six rings; 2,080 m: fifteen rings.
+    assert [choose_rings_per_group(m) for m in (192.0, 704.0, 768.0, 832.0, 2080.0)] == [1, 1, 1, 2, 3]
+    assert name_source("generated", "4-6") == "generated-ring-4-6"
+    assert name_source("ceiling", "4-6") == "ceiling"
 
 
 def test_label_follows_thresholds_of_dataset():
@@ -106,7 +108,8 @@ def test_level_is_that_of_the_ground_next_to_the_origin():
 
 def test_quantities_are_averaged_by_ring_over_kept_windows():
     def row(ring, cars, kept=True):
-        return {name: 0.0 for name in QUANTITIES} | {"ring": ring, "kept": kept, "vehicle_small_per_ha": cars}
+        values = {"ring": ring, "group": name_group(ring), "kept": kept, "vehicle_small_per_ha": cars}
+        return {name: 0.0 for name in QUANTITIES} | values
 
     scores = compute_quantity_scores([row(2, 6.0), row(0, 1.0), row(1, 3.0), row(1, np.nan), row(2, 90.0, kept=False)])
     means = {group: found["vehicle_small_per_ha"].value for group, found in scores.items()}
@@ -140,7 +143,7 @@ def test_quantities_are_averaged_by_label():
 
 def test_whole_cities_are_scored_by_blocks_traffic_and_seams():
     def make(city, angles_m, traffic=None, seams=None):
-        rows = [{"ring": 0}, {"ring": 2}]
+        rows = [{"ring": 2, "group": "2"}, {"ring": 0, "group": "0-1"}]
         blocks_m2 = np.array([2000.0, 3000.0, 7000.0])
         overview = np.zeros((2, 2, 3), np.uint8)
         return CityResult("side", city, rows, angles_m, blocks_m2, 0.9, 20_000.0, seams or {}, overview, traffic)
@@ -150,12 +153,13 @@ def test_whole_cities_are_scored_by_blocks_traffic_and_seams():
     record = np.zeros(SEAM_RECORD_SHAPE)
     record[..., 1] = 10.0
     record[0, :, 0] = 6.0, 3.0  # Twice as many class changes at the seam.
-    one = make("one", along, Traffic(100, 80, 60), {2: record})
-    other = make("other", across, Traffic(100, 100, 100), {2: record})
+    one = make("one", along, Traffic(100, 80, 60), {"2": record})
+    other = make("other", across, Traffic(100, 100, 100), {"2": record})
     scores = compute_whole_scores([one, other], [one, other])
     assert scores["city_blocks_per_ha"] == pytest.approx(1.5) and scores["median_city_block_m2"] == 3000.0
     assert scores["vehicles_routed"].value == pytest.approx(0.9)
     assert scores["vehicles_arrived"].value == pytest.approx((0.75 + 1) / 2)
+    assert list(scores["street_distance"]) == ["0-1", "2", "all"]
     assert scores["street_distance"]["2"].value == pytest.approx(1)  # A town is not compared with itself.
     assert set(scores["seams"]) == {"2", "all"}
     assert scores["seams"]["2"]["class_changes"].value == pytest.approx(2)
