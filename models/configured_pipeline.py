@@ -398,6 +398,11 @@ class ConfiguredPipeline:
         return self.lvae.spec
 
     @property
+    def label_kind(self) -> str:
+        """Kind of label, a key of `models.labels.LABELS`."""
+        return self.dit.config.label
+
+    @property
     def has_split_latent(self) -> bool:
         """True if the first half of the channels of a latent belongs to the ground, the second half to the objects."""
         return self.lvae.config.split_latent

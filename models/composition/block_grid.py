@@ -72,6 +72,23 @@ def find_rank(order: str) -> Callable[[BlockIndex], int]:
     return RANKS[order]
 
 
+def find_free_blocks(name: str) -> Callable[[BlockIndex], bool]:
+    """Return the function that tells which blocks count as crops at any place and heading.
+
+    Args:
+        name: Key of FREE_BLOCKS.
+
+    Returns:
+        Function from the index of a block to whether it counts as such a crop.
+
+    Raises:
+        ValueError: The name is unknown.
+    """
+    if name not in FREE_BLOCKS:
+        raise ValueError(f"free_blocks is {name!r}, expected one of: {', '.join(FREE_BLOCKS)}")
+    return FREE_BLOCKS[name]
+
+
 class Arrangement(NamedTuple):
     """How blocks are arranged.
 
@@ -330,8 +347,7 @@ def label_blocks(
     Raises:
         ValueError: The map has another size, a label is unknown, or `free_blocks` is unknown.
     """
-    if free_blocks not in FREE_BLOCKS:
-        raise ValueError(f"free_blocks is {free_blocks!r}, expected one of: {', '.join(FREE_BLOCKS)}")
+    is_free = find_free_blocks(free_blocks)
     ahead, behind, left, right = num_blocks
     rows, cols = ahead + behind + 1, left + right + 1
     labels = [[label] * cols] * rows if isinstance(label, str) else label
@@ -345,5 +361,5 @@ def label_blocks(
     by_block = {}
     for index in product(range(-behind, ahead + 1), range(-right, left + 1)):
         name = labels[ahead - index[0]][left - index[1]]
-        by_block[index] = mark_free(kind, name) if FREE_BLOCKS[free_blocks](index) else name
+        by_block[index] = mark_free(kind, name) if is_free(index) else name
     return by_block

@@ -40,6 +40,11 @@ class SceneGenerator(Protocol):
         ...
 
     @property
+    def label_kind(self) -> str:
+        """Kind of label, a key of `models.labels.LABELS`."""
+        ...
+
+    @property
     def plans_streets(self) -> bool:
         """True if the model can plan streets."""
         ...

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from models.composition.block_grid import BlockGrid, BlockIndex, choose_arrangement, find_rank
+from models.composition.block_grid import BlockGrid, BlockIndex, choose_arrangement, find_free_blocks, find_rank
 from models.composition.generator import SceneGenerator
 from models.composition.outpaint import (
     BlockComposer,
@@ -19,6 +19,7 @@ from models.composition.outpaint import (
     uses_street_plan,
 )
 from models.composition.road_sketch import Streets
+from models.labels import mark_free
 from models.sampling.repaint import InpaintingConfig
 from models.scene import Grid, Scene
 
@@ -33,6 +34,8 @@ class InfiniteScene:
     Args:
         model: A PrITTIPipeline.
         label: One label for all blocks, or a function that returns the label for a block index.
+        free_blocks: Blocks that count as crops at any place and heading, a key of FREE_BLOCKS; it has no effect on a
+            function.
         seed: Seed of the scene.
         overlap: Fraction of a block that overlaps its neighbour; it must be below 0.5 with the order "colours".
         mode: "reencode", "copy" or "paper"; see `PrITTIPipeline.outpaint`.
@@ -51,8 +54,8 @@ class InfiniteScene:
             (`outpaint.uses_street_plan`).
 
     Raises:
-        ValueError: The order or the label is unknown, the overlap is 0.5 or more with "colours", or the model cannot
-            follow the roads.
+        ValueError: The order, the label or `free_blocks` is unknown, the overlap is 0.5 or more with "colours", or the
+            model cannot follow the roads.
     """
 
     def __init__(
@@ -70,8 +73,10 @@ class InfiniteScene:
         order: str = "colours",
         margin: float | None = None,
         plan_streets: bool | None = None,
+        free_blocks: str = "all",
     ) -> None:
         self.model, self.label, self.seed, self.scene_index = model, label, seed, scene_index
+        self.is_free = find_free_blocks(free_blocks)
         self.options: dict[str, Any] = {"mode": mode, "repaint": repaint, "guidance_scale": guidance_scale}
         self.plans_streets = uses_street_plan(model, roads, mode, True, plan_streets)
         size = model.latent_shape[-1]
@@ -95,7 +100,9 @@ class InfiniteScene:
         Returns:
             The label.
         """
-        return self.label if isinstance(self.label, str) else self.label(index)
+        if not isinstance(self.label, str):
+            return self.label(index)
+        return mark_free(self.model.label_kind, self.label) if self.is_free(index) else self.label
 
     def get_block(self, index: BlockIndex) -> SceneBlock:
         """Return a block. If the block does not exist, generate its missing predecessors and then the block.
@@ -128,7 +135,9 @@ class InfiniteScene:
             self.composer.level_m = find_ground_height(first, 0.0, 0.0)
             if self.plans_streets and self.plan is None:
                 step_m = self.composer.step_m
-                plan = make_street_plan(self.model, first, self.roads, self.label, step_m, self.seed, self.scene_index)
+                plan = make_street_plan(
+                    self.model, first, self.roads, self.label_of, step_m, self.seed, self.scene_index
+                )
                 self.plan, self.composer.roads = plan, [*self.roads, plan]
         label = self.label_of(index)
         like = self.model.new_identity("city", self.seed, 0, label)

@@ -1,6 +1,7 @@
 """Tests of transformers that read the known part of a scene: masks, training, sampling and outpainting."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 from helpers import QUICK, random_scene, small_spec, tiny_pipeline
 from torch import Tensor
 
-from models.composition.block_grid import choose_arrangement, label_blocks
+from models.composition.block_grid import choose_arrangement
 from models.composition.infinite import InfiniteScene
 from models.composition.inpaint import make_latent_mask
 from models.composition.road_sketch import RoadMap
@@ -252,13 +253,26 @@ def test_infinite_scene_has_the_blocks_of_the_large_scene(pipeline, order, overl
     large = pipeline.outpaint(scene, "low", seed=3, index=1, num_blocks=steps, order=order, overlap=overlap, **options)
     assert large.grid.rows == 32 + 2 * 32 * (1 - overlap)
     options |= {"order": order, "overlap": overlap}
-    labels = label_blocks(pipeline.dit.config.label, "low", steps, "all")
-    infinite = InfiniteScene(pipeline, labels.__getitem__, seed=3, scene=scene, scene_index=1, **options)
+    infinite = InfiniteScene(pipeline, "low", seed=3, scene=scene, scene_index=1, **options)
     infinite.drop_block((0, 0))
-    whole = infinite.composer.stitch({index: infinite.get_block(index) for index in labels}, scene)
+    whole = infinite.composer.stitch(
+        {index: infinite.get_block(index) for index in product(range(3), range(-2, 1))}, scene
+    )
     # The large scene is generated in batches, which changes the rounding.
     assert np.mean(whole.occupied != large.occupied) < 1e-3 and len(whole) == len(large)
     assert np.abs(whole.center_m - large.center_m).max() < 0.01
+
+
+def test_far_blocks_of_an_infinite_scene_are_crops(pipeline):
+    config = {**pipeline.dit.config, "label": "partial", "schedule": pipeline.dit.diffusion}
+    model = PrITTIPipeline(pipeline.lvae, DiT(**config))
+    for free_blocks, ahead, beside in (("all", "-free", "-free"), ("off-street", "", "-free"), ("none", "", "")):
+        infinite = InfiniteScene(model, "low-any", free_blocks=free_blocks)
+        found = [infinite.label_of(index) for index in ((0, 0), (2, 0), (0, 1))]
+        assert found == ["low-any", "low-any" + ahead, "low-any" + beside]
+    assert InfiniteScene(model, lambda index: "any-high").label_of((3, 3)) == "any-high"
+    with pytest.raises(ValueError, match="free_blocks is 'some', expected one of: none, off-street, all"):
+        InfiniteScene(model, "low-any", free_blocks="some")
 
 
 def test_known_streets_hold_latents_of_streets_only():
