@@ -287,7 +287,7 @@ class Start:
 
     digest: str
     inherited: dict  # Shift and scale of the latents, and noise schedule, for these weights.
-    sampling: dict  # Arguments of the pipeline: sampler, number of steps, noise scaling, existence threshold, guidance.
+    sampling: dict  # Arguments of the pipeline: sampler, number of steps, noise scaling, guidance, street planner.
     state: dict[str, Tensor]
 
 
@@ -341,7 +341,8 @@ def load_start(model: str, lvae_digest: str, architecture: dict, option: str = "
         "pag_drops_label",
         "street_pag_factor",
     )
-    sampling = {"scheduler": pipeline.scheduler_config} | {name: pipeline.config[name] for name in names}
+    parts = {"scheduler": pipeline.scheduler_config, "street_planner": pipeline.street_planner}
+    sampling = parts | {name: pipeline.config[name] for name in names}
     return Start(digest_weights(pipeline.dit), inherited, sampling, pipeline.dit.state_dict())
 
 
@@ -371,7 +372,7 @@ def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
 
     Args:
         lvae: Directory of the layout VAE.
-        sampling: Entries of the config of the pipeline, such as `noise_scaling`.
+        sampling: Arguments of the pipeline, such as `noise_scaling`.
         output: Directory that contains dit/. This directory is also returned.
     """
     dit = DiT.from_pretrained(storage.join_uri(output, "dit"))

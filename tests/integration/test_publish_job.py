@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from helpers import tiny_planner
 
 from models.pretrained import CHECKSUMS_NAME, compute_checksums
 
@@ -154,6 +155,7 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     start, more = str(tmp_path / "start"), tmp_path / "more"
     pipeline = load_pipeline(str(smoke / "models/pritti-smoke"))
     pipeline.register_to_config(noise_scaling=1.01, existence_threshold=0.25)
+    pipeline.street_planner = tiny_planner()
     pipeline.save_pretrained(start)
     options = {"final_learning_rate": 1e-5, "warmup_steps": 1, "steps": 2}
     run, complete = prepare(Config(preset="smoke", name="more", start_from=start, **options))
@@ -171,10 +173,10 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     ]
     assert history[1].options["start_from"] == history[0].weights == digest_weights(first)
     first.save_pretrained(more / "dit")
-    sampling = load_pipeline(complete(str(more))).config
-    assert (
-        sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25
-    )  # both settings have the values of the initial pipeline
+    result = load_pipeline(complete(str(more)))
+    # The settings and the street planner are those of the initial pipeline.
+    assert result.config["noise_scaling"] == 1.01 and result.config["existence_threshold"] == 0.25
+    assert result.plans_streets
     with pytest.raises(ValueError, match=r"its label is vegetation, but that of this run is vehicle"):
         prepare(Config(preset="smoke", name="other", start_from=start, label_kind="vehicle"))
     with pytest.raises(ValueError, match=r"--start-from town: .* another layout VAE"):
