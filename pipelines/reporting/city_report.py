@@ -16,6 +16,7 @@ from pipelines.reporting.evaluation_report import format_value
 from pipelines.reporting.report import Charts, Picture, Pictures, Section, Table, Text, render_report_html
 
 CELL_PX = 56
+SIDES = ("generated", "reference", "ceiling")  # Order of the values in the table by label.
 LEVEL_M = 5.0  # Difference of the level of the ground at which the colour of a map is fullest (m).
 EPSILON = 1e-6  # Added to values before their ratio, so that a value expected to be 0 is red.
 FEW_COLOR, MANY_COLOR = np.array([49, 104, 180]), np.array([190, 60, 40])  # A quarter or less; four times or more.
@@ -98,22 +99,26 @@ def build_quantity_table(scores: Mapping[str, Any]) -> Table:
 def build_label_table(scores: Mapping[str, Any]) -> Table:
     """Build the table of the mean of each quantity by label, in cities with several labels."""
     labels = scores["labels"]
+
+    def average(name: str, side: str) -> dict[str, float] | None:
+        found = [sides.get(side, {}).get(name) for sides in labels.values()]
+        known = [estimate["value"] for estimate in found if estimate]
+        return {"value": float(np.mean(known))} if len(known) == len(found) else None
+
     rows = [
         (
             spell_name(name),
-            *(
-                format_means(*(sides.get(side, {}).get(name) for side in ("generated", "reference", "ceiling")))
-                for sides in labels.values()
-            ),
+            *(format_means(*(sides.get(side, {}).get(name) for side in SIDES)) for sides in labels.values()),
+            format_means(*(average(name, side) for side in SIDES)),
         )
         for name in QUANTITIES
     ]
     note = (
         "Each cell holds the mean over the windows with the label, and in brackets those of the reference and of the"
-        " ceiling (–: no window of a town has the label). The streets of the reference are cut at the border of each"
-        " scene."
+        " ceiling (–: no window of a town has the label). The last column is the mean over the labels. The streets of"
+        " the reference are cut at the border of each scene."
     )
-    return Table("Quantities by label", ("quantity", *labels), rows, note=note)
+    return Table("Quantities by label", ("quantity", *labels, "mean of labels"), rows, note=note)
 
 
 def format_means(*estimates: Mapping[str, float] | None) -> str:
@@ -215,7 +220,7 @@ def draw_ring_charts(scores: Mapping[str, Any]) -> Charts:
         for side, groups in scores["quantities"].items():
             if side not in ("reference", "ceiling"):
                 known = [
-                    (0.5 if group == "0-1" else float(group), found[name]["value"])
+                    (float(np.mean([int(ring) for ring in group.split("-")])), found[name]["value"])
                     for group, found in groups.items()
                     if group != "all" and found[name]
                 ]
@@ -224,7 +229,7 @@ def draw_ring_charts(scores: Mapping[str, Any]) -> Charts:
         for side in ("ceiling", "reference"):
             value = scores["quantities"][side]["all"][name]["value"]
             series[side] = ([0, max(last, 1)], [value, value])
-        charts.append(Chart(spell_name(name), series, "ring (0.5: rings 0 and 1)", spell_name(name)))
+        charts.append(Chart(spell_name(name), series, "ring, or middle of a group of rings", spell_name(name)))
     return Charts("Rings", charts)
 
 

@@ -25,7 +25,7 @@ from pipelines.evaluation.cities import (
 from pipelines.evaluation.traffic import Traffic
 from pipelines.metrics.cities import QUANTITIES, SEAM_RECORD_SHAPE
 from pipelines.metrics.validity import judge_densities
-from pipelines.reporting.city_report import CELL_PX, build_label_table, draw_map
+from pipelines.reporting.city_report import CELL_PX, build_label_table, draw_map, draw_ring_charts
 from pipelines.schema.density_labels import DensityThresholds
 
 
@@ -116,6 +116,13 @@ def test_quantities_are_averaged_by_ring_over_kept_windows():
     assert means == {"0-1": 2.0, "2": 6.0, "all": pytest.approx(10 / 3)}
 
 
+def test_charts_show_groups_at_their_middle_ring():
+    groups = {group: {name: {"value": 1.0} for name in QUANTITIES} for group in ("0-1", "2", "3-6", "all")}
+    sides = {"generated": groups, "reference": {"all": groups["all"]}, "ceiling": {"all": groups["all"]}}
+    chart = draw_ring_charts({"quantities": sides}).charts[0]
+    assert chart.series["generated"] == ([0.5, 2.0, 4.5], [1.0] * 3) and chart.series["ceiling"][0] == [0, 4.5]
+
+
 def test_quantities_are_averaged_by_label():
     def row(label, cars, kept=True):
         return {name: 0.0 for name in QUANTITIES} | {"label": label, "kept": kept, "vehicle_small_per_ha": cars}
@@ -136,9 +143,15 @@ def test_quantities_are_averaged_by_label():
         for label, sides in scores.items()
     }
     table = build_label_table({"labels": written})
-    assert table.columns == ("quantity", "low-low")
-    cells = dict(table.rows)
-    assert cells["vehicle small per ha"] == "2 (5, 4)" and cells["road share"] == "0 (0, 0)"
+    assert table.columns == ("quantity", "low-low", "mean of labels")
+    cells = {name: values for name, *values in table.rows}
+    assert cells["vehicle small per ha"] == ["2 (5, 4)"] * 2 and cells["road share"] == ["0 (0, 0)"] * 2
+    more = {
+        "generated": {"vehicle_small_per_ha": {"value": 4.0}},
+        "reference": {"vehicle_small_per_ha": {"value": 9.0}},
+    }
+    cells = {name: values for name, *values in build_label_table({"labels": written | {"high-any": more}}).rows}
+    assert cells["vehicle small per ha"] == ["2 (5, 4)", "4 (9, –)", "3 (7, –)"]
 
 
 def test_whole_cities_are_scored_by_blocks_traffic_and_seams():
