@@ -70,9 +70,13 @@ browser:
 	fi
 
 .venv/ready: pyproject.toml infra/constraints.txt
-	@echo "installing packages to .venv, 2 to 5 minutes"
+	@echo "installing packages to .venv, 1 to 5 minutes"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	PIP_CONSTRAINT=infra/constraints.txt $(BIN)/pip install --disable-pip-version-check -q -e '.[dev]'
+	@# uv needs a fifth of pip's time. It does not read pip.conf, so pip is the fallback.
+	( $(BIN)/pip install --disable-pip-version-check -q uv==0.13.9 && \
+	    UV_SYSTEM_CERTS=1 VIRTUAL_ENV=.venv $(BIN)/uv pip install -q $${PIP_FIND_LINKS:+--find-links "$$PIP_FIND_LINKS"} \
+	    $${PIP_INDEX_URL:+--default-index "$$PIP_INDEX_URL"} -c infra/constraints.txt -e '.[dev]' ) || \
+	  PIP_CONSTRAINT=infra/constraints.txt $(BIN)/pip install --disable-pip-version-check -q -e '.[dev]'
 	@# The OpenDRIVE schemas for a test. Its dependencies would install an older numpy.
 	$(BIN)/pip install --disable-pip-version-check -q --no-deps asam-qc-opendrive==1.0.0
 	@# The glTF validator of Khronos, for a test that is skipped without it.
