@@ -47,8 +47,8 @@ class Config:
     num_towns: int = 5
     """Number of procedural towns of the ceiling, at least 2."""
     rings_per_group: int | None = None
-    """Number of rings that are scored together; ring 0 belongs to the first group (default: 1 for cities of up to 768
-    m, more for larger ones, so that there are at most five groups)."""
+    """Number of rings that are scored together; ring 0 belongs to the first group (default: 1 for cities below 832 m,
+    more for larger ones, so that there are at most five groups)."""
     traffic: bool = True
     """Simulate traffic on the streets with SUMO, if it is installed (extra traffic or $SUMO_HOME)."""
     output: str = ""

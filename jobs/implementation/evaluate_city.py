@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import pyarrow as pa
@@ -30,6 +31,7 @@ from pipelines.evaluation.cities import (
     compute_quantity_scores,
     compute_whole_scores,
     format_label,
+    list_groups,
     measure_cities,
     name_source,
     parse_label,
@@ -85,35 +87,26 @@ def evaluate_city(config: Config) -> dict:
             f"a city of run {config.run} has a side of {extent_m:g} m, expected at least {MIN_EXTENT_M:g} m, which hold"
             " rings 0 and 1; use outpaint_scenes.py --extent-m"
         )
-    rings_per_group = config.rings_per_group or choose_rings_per_group(extent_m)
+    make_request = partial(
+        CityRequest,
+        traffic=traffic,
+        label=label,
+        rings_per_group=config.rings_per_group or choose_rings_per_group(extent_m),
+    )
     jobs = [
-        CityRequest(
+        make_request(
             side,
             number,
             city.tiles,
             corner_m=records[side].corner_m,
             seams_m=records[side].seams_m,
-            traffic=traffic,
-            label=label,
             block_labels=records[side].block_labels,
-            rings_per_group=rings_per_group,
         )
         for side, listed in cities.items()
         for number, city in enumerate(listed)
     ]
     town_m = min(extent_m, MAX_TOWN_EXTENT_M)
-    jobs += [
-        CityRequest(
-            CEILING,
-            k,
-            town_seed=TOWN_SEEDS_START + k,
-            extent_m=town_m,
-            traffic=traffic,
-            label=label,
-            rings_per_group=rings_per_group,
-        )
-        for k in range(config.num_towns)
-    ]
+    jobs += [make_request(CEILING, k, town_seed=TOWN_SEEDS_START + k, extent_m=town_m) for k in range(config.num_towns)]
     with hold_output(output, "evaluation", config):
         root = storage.join_uri(output, "windows")
         storage.delete_directory(root)
@@ -221,7 +214,7 @@ def score_rings(
         (side, group): SceneSubset(root, name_source(side, group), SPLIT)
         for side in rows
         if side not in (REFERENCE, CEILING)
-        for group in dict.fromkeys(row["group"] for row in sorted(rows[side], key=lambda row: row["ring"]))
+        for group in list_groups(rows[side])
     }
     sets[CEILING, "all"] = SceneSubset(root, CEILING, SPLIT)
     counts = {key: count_scenes(subset) for key, subset in sets.items()}

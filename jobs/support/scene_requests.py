@@ -16,9 +16,7 @@ def select_scenes(options: SceneOptions) -> SceneSubset:
     """Return the subset of scenes that the options select."""
     directory = resolve_path(options.input, "generated")
     limit = None if options.scene_ids else options.max_scenes
-    return SceneSubset(
-        directory, options.source or None, options.split or None, limit, "first", ids=tuple(options.scene_ids)
-    )
+    return SceneSubset(directory, options.source or None, options.split or None, limit, "first", ids=options.scene_ids)
 
 
 def make_execution(options: RePaintOptions) -> SamplingExecution:

@@ -373,6 +373,11 @@ def name_group(ring: int, rings_per_group: int = 1) -> str:
     return str(first) if first == last else f"{first}-{last}"
 
 
+def list_groups(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the groups of rings of rows of windows, from the centre outwards."""
+    return list(dict.fromkeys(row["group"] for row in sorted(rows, key=lambda row: row["ring"])))
+
+
 def choose_rings_per_group(extent_m: float) -> int:
     """Return the number of rings per group, so that a report has at most MAX_GROUPS groups.
 
@@ -525,10 +530,7 @@ def compute_quantity_scores(rows: Sequence[dict]) -> dict[str, dict[str, Estimat
         For each group of rings from the centre outwards, and for "all": estimates by QUANTITIES.
     """
     kept = [row for row in rows if row["kept"]]
-    groups: dict[str, list[dict]] = {}
-    for row in sorted(kept, key=lambda row: row["ring"]):
-        groups.setdefault(row["group"], []).append(row)
-    groups["all"] = kept
+    groups = {group: [row for row in kept if row["group"] == group] for group in list_groups(kept)} | {"all": kept}
     return {group: _estimate_quantities(chosen) for group, chosen in groups.items() if chosen}
 
 
@@ -586,8 +588,7 @@ def compute_whole_scores(results: Sequence[CityResult], towns: Sequence[CityResu
     towns_m = np.array([town.angles_m.sum(axis=0) for town in towns])
     distances: dict[str, Any] = {}
     seams: dict[str, Any] = {}
-    rows = sorted((row for result in results for row in result.rows), key=lambda row: row["ring"])
-    for group in (*dict.fromkeys(row["group"] for row in rows), "all"):
+    for group in (*list_groups([row for result in results for row in result.rows]), "all"):
         of_group = [[group in (row["group"], "all") for row in result.rows] for result in results]
         angles_m = np.array([r.angles_m[mask].sum(axis=0) for r, mask in zip(results, of_group, strict=True)])
         found = compute_street_distances(angles_m, towns_m)

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipelines.schema.columns import SCENES
+from pipelines.schema.scene_subset import find_scene_ids, select_evenly
 from pipelines.schema.tables import Shard, find_shards
 
 SORTS = {
@@ -103,23 +104,12 @@ class Catalogue:
         Raises:
             ValueError: A scene does not exist. The message names some existing scenes.
         """
-        known = self.scenes["scene_id"].to_pylist()
-        index = {scene_id: k for k, scene_id in enumerate(known)}
-        for wanted in scene_ids:
-            if wanted not in index:
-                alike = [name for name in known if wanted in name][:3]
-                some = alike or [known[k] for k in self.spread(np.arange(len(known)), 3)]
-                raise ValueError(
-                    f"{self.root}: no scene {wanted!r} among {len(known)} scenes; existing scenes include"
-                    f" {', '.join(some)}"
-                )
-        return np.array([index[wanted] for wanted in scene_ids], int)
+        return find_scene_ids(self.root, self.scenes["scene_id"].to_pylist(), scene_ids)
 
     @staticmethod
     def spread(order: np.ndarray, count: int) -> np.ndarray:
         """Return at most `count` evenly spaced entries of `order`."""
-        count = min(count, len(order))
-        return order[np.floor((np.arange(count) + 0.5) * len(order) / max(count, 1)).astype(int)]
+        return order[select_evenly(len(order), min(count, len(order)))]
 
     def draw(self, count: int, seed: int) -> np.ndarray:
         """Return the indices of at most `count` random scenes without repetition."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from difflib import get_close_matches
 from functools import cached_property
 from typing import Any, Literal, get_args
 
@@ -113,15 +113,8 @@ class SceneSubset:
 
     def _find_ids(self, shards: list[Shard]) -> np.ndarray:
         """Return the row numbers of the scenes with the ids, counted over all shards, in ascending order."""
-        known = np.concatenate([shard.read("scenes", ["scene_id"])["scene_id"].to_numpy() for shard in shards])
-        for wanted in self.ids:
-            if wanted not in known:
-                alike = [name for name in known if wanted in name] or get_close_matches(wanted, known) or known
-                raise ValueError(
-                    f"{self.root}: no scene {wanted!r} among {len(known)} scenes; existing scenes include"
-                    f" {', '.join(alike[:3])}"
-                )
-        return np.flatnonzero(np.isin(known, self.ids))
+        known = [name for shard in shards for name in shard.read("scenes", ["scene_id"])["scene_id"].to_pylist()]
+        return np.unique(find_scene_ids(self.root, known, self.ids))
 
     def chosen(self, scenes: pa.Table, source: np.ndarray) -> np.ndarray:
         """Select rows of a table of all scenes.
@@ -149,6 +142,31 @@ class SceneSubset:
         if self.pick == "balanced":
             return select_balanced(list_label_pairs(scenes), wanted)
         return select_evenly(total, wanted)
+
+
+def find_scene_ids(root: str, known: Sequence[str], wanted: Sequence[str]) -> np.ndarray:
+    """Find scenes by their ids.
+
+    Args:
+        root: Dataset directory, for the message.
+        known: Ids of all scenes.
+        wanted: Ids to find.
+
+    Returns:
+        (k,) indices in `known`, in the order of `wanted`.
+
+    Raises:
+        ValueError: A scene does not exist. The message names some existing scenes.
+    """
+    index = {scene_id: k for k, scene_id in enumerate(known)}
+    for name in wanted:
+        if name not in index:
+            alike = [other for other in known if name in other][:3]
+            some = alike or [known[k] for k in select_evenly(len(known), min(3, len(known)))]
+            raise ValueError(
+                f"{root}: no scene {name!r} among {len(known)} scenes; existing scenes include {', '.join(some)}"
+            )
+    return np.array([index[name] for name in wanted], int)
 
 
 def read_described_columns(parts: list[tuple[Shard, list[int]]]) -> tuple[pa.Table, np.ndarray]:

@@ -266,10 +266,10 @@ def test_infinite_scene_has_the_blocks_of_the_large_scene(pipeline, order, overl
 def test_far_blocks_of_an_infinite_scene_are_crops(pipeline):
     config = {**pipeline.dit.config, "label": "partial", "schedule": pipeline.dit.diffusion}
     model = PrITTIPipeline(pipeline.lvae, DiT(**config))
-    for free_blocks, ahead, beside in (("all", "-free", "-free"), ("off-street", "", "-free"), ("none", "", "")):
+    for free_blocks, ahead, left in (("all", "-free", "-free"), ("off-street", "", "-free"), ("none", "", "")):
         infinite = InfiniteScene(model, "low-any", free_blocks=free_blocks)
         found = [infinite.label_of(index) for index in ((0, 0), (2, 0), (0, 1))]
-        assert found == ["low-any", "low-any" + ahead, "low-any" + beside]
+        assert found == ["low-any", "low-any" + ahead, "low-any" + left]
     assert InfiniteScene(model, lambda index: "any-high").label_of((3, 3)) == "any-high"
     with pytest.raises(ValueError, match="free_blocks is 'some', expected one of: none, off-street, all"):
         InfiniteScene(model, "low-any", free_blocks="some")
