@@ -162,7 +162,8 @@ def find_scene_ids(root: str, known: Sequence[str], wanted: Sequence[str]) -> np
     for name in wanted:
         if name not in index:
             alike = [other for other in known if name in other][:3]
-            some = alike or [known[k] for k in select_evenly(len(known), min(3, len(known)))]
+            spread: list[int] = select_evenly(len(known), min(3, len(known))).tolist()
+            some = alike or [known[k] for k in spread]
             raise ValueError(
                 f"{root}: no scene {name!r} among {len(known)} scenes; existing scenes include {', '.join(some)}"
             )

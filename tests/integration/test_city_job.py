@@ -20,7 +20,7 @@ BUILDING = CATEGORY_INDEX["construction_big"]
 
 
 @pytest.fixture(scope="module")
-def real(tmp_path_factory) -> str:
+def real(tmp_path_factory, cluster) -> str:
     root = tmp_path_factory.mktemp("town")
     preprocess(Town(num_train=24, num_test=48, town_version=2, free_pose_share=0.5, output=str(root)))
     return str(root)
