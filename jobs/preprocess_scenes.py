@@ -5,6 +5,7 @@
     jobs/preprocess_scenes.py town --num-train 500 --num-test 100
     jobs/preprocess_scenes.py kitti360 --input KITTI-360 --output DIR
     jobs/preprocess_scenes.py av2 --input AV2 --output DIR
+    jobs/preprocess_scenes.py osm --input city.osm.pbf --origin 52.474 13.440 --radius-m 500 --output DIR
     jobs/preprocess_scenes.py own --input DRIVES --output DIR             your own drives: docs/how_to/own_drives.md
 
 The job writes the tables scenes, primitives, rasters and rejects, and dataset.json. Run the same command again to
@@ -80,6 +81,40 @@ class Av2:
 
 
 @dataclass(frozen=True)
+class Osm:
+    """Read extracts of OpenStreetMap: real roads, buildings and trees (docs/how_to/real_places.md)."""
+
+    input: tuple[str, ...]
+    """Extracts (.osm, .osm.gz, .osm.bz2 or .osm.pbf), or directories of extracts."""
+    output: str = ""
+    """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/osm)."""
+    if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
+    bbox: tuple[float, float, float, float] | None = None
+    """Region: west, south, east and north in degrees (default: the whole extract)."""
+    origin: tuple[float, float] | None = None
+    """Latitude and longitude of the middle of a square region, instead of --bbox (default: the whole extract)."""
+    radius_m: float = 500.0
+    """Half of the side of the square around --origin."""
+    spacing_m: float = 10.0
+    """Distance between successive poses along a street."""
+    free_pose_share: float = 0.25
+    """Share of the scenes that are crops at any place and heading, instead of views of a vehicle."""
+    test_share: float = 0.1
+    """Share of the scenes that lie in test squares of 400 m."""
+    drive_on: Literal["right", "left"] = "right"
+    """Side of the road on which vehicles drive."""
+    furnish: bool = False
+    """Add parked cars, plants, lamps, signs, sidewalks and gardens that the extract lacks, with the rules of the town.
+    The labels of added objects begin with "furnished"."""
+    seed: int = 0
+    """Random seed of free poses and added objects."""
+    slots: Literal["p95", "p99.5", "paper"] = "p99.5"
+    """Rule for the number of slots per category: a percentile over the training split, or the paper's 514 slots in
+    total. Models do not learn objects beyond these slots."""
+
+
+@dataclass(frozen=True)
 class Own:
     """Read your own drives from Parquet or JSON files under --input/DRIVE (docs/how_to/own_drives.md)."""
 
@@ -102,6 +137,7 @@ Config = (
     Annotated[Town, tyro.conf.subcommand("town")]
     | Annotated[Kitti360, tyro.conf.subcommand("kitti360")]
     | Annotated[Av2, tyro.conf.subcommand("av2")]
+    | Annotated[Osm, tyro.conf.subcommand("osm")]
     | Annotated[Own, tyro.conf.subcommand("own")]
 )
 DEFAULT = Town()  # source if the command line does not name a source

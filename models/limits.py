@@ -37,6 +37,8 @@ LIMITS = {
     "table_bytes": Limit(2**29, "estimated bytes in memory of the columns that are read from a table file"),
     "text_characters": Limit(1_000, "characters of an id, a label or a name"),
     "polygon_points": Limit(10_000, "points of a polygon"),
+    "map_bytes": Limit(2**30, "bytes of an extract of OpenStreetMap or of an OpenDRIVE file"),
+    "map_features": Limit(2_000_000, "features with tags in an extract of OpenStreetMap"),
     "json_bytes": Limit(2**28, "bytes of a JSON or XML file"),
     "json_values": Limit(2**23, "commas, colons and opening brackets of a JSON text"),
     "glb_bytes": Limit(2**28, "bytes of a GLB file"),

@@ -245,6 +245,7 @@ class Scene:
         vegetation_density: Density label of the vegetation; None: unknown.
         vehicle_density: Density label of the vehicles; None: unknown.
         free_pose: Whether the scene is a crop at any place and heading; False for a view of a vehicle.
+        attribution: Licence notice that copies of the scene must state; None if there is none.
     """
 
     scene_id: str
@@ -270,6 +271,7 @@ class Scene:
     vegetation_density: str | None = None
     vehicle_density: str | None = None
     free_pose: bool = False
+    attribution: str | None = None
 
     def __post_init__(self) -> None:
         n = len(self.category)

@@ -7,13 +7,16 @@ from dataclasses import asdict
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from jobs.implementation.checks import check_preprocess_scenes
-from jobs.preprocess_scenes import Av2, Kitti360, Own, Town
+from jobs.preprocess_scenes import Av2, Kitti360, Osm, Own, Town
 from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from models.layout import PAPER_SLOTS
 from pipelines.preprocess import sharding
 from pipelines.preprocess.ingest import ingest_drives
+from pipelines.preprocess.sources.osm.extract import Region
+from pipelines.preprocess.sources.osm.reader import OsmOptions
+from pipelines.schema.attribution import find_attribution
 
 NOT_RECORDED = ("output", "skip_unreadable", "if_busy", "log_format")
 SLOTS = {"p95": 95.0, "p99.5": 99.5, "paper": PAPER_SLOTS}  # Percentile, or number of slots per category.
@@ -27,11 +30,29 @@ def find_free_pose_share(config: Town) -> float:
     return default if config.free_pose_share is None else config.free_pose_share
 
 
-def plan_shards(config: Town | Kitti360 | Av2 | Own) -> list:
+Config = Town | Kitti360 | Av2 | Osm | Own
+
+
+def make_osm_options(config: Osm) -> OsmOptions:
+    """Return the options of the reader."""
+    return OsmOptions(
+        Region(config.bbox, config.origin, config.radius_m),
+        config.spacing_m,
+        config.free_pose_share,
+        config.drive_on == "left",
+        config.furnish,
+        config.seed,
+    )
+
+
+def plan_shards(config: Config) -> list:
     """Return the shards to write."""
     if isinstance(config, Town):
         share = find_free_pose_share(config)
         return sharding.plan_town(config.num_train, config.num_test, config.seed, config.town_version, share)
+    if isinstance(config, Osm):
+        inputs = tuple(make_absolute(path) for path in config.input)
+        return sharding.plan_osm(inputs, make_osm_options(config), config.test_share)
     root = make_absolute(config.input)
     if isinstance(config, Av2):
         return sharding.plan_argoverse2(root)
@@ -39,7 +60,7 @@ def plan_shards(config: Town | Kitti360 | Av2 | Own) -> list:
     return plan_drives(root, config.make_split, config.skip_unreadable)
 
 
-def make_recorded_options(config: Town | Kitti360 | Av2 | Own) -> dict:
+def make_recorded_options(config: Config) -> dict:
     """Return the options that dataset.json records; a run with other options cannot resume."""
     options = {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED}
     options["source"] = type(config).__name__.lower()
@@ -48,10 +69,12 @@ def make_recorded_options(config: Town | Kitti360 | Av2 | Own) -> dict:
         share = {"free_pose_share": find_free_pose_share(config)} if config.town_version > 1 else {}
         slots = config.slots or ("p99.5" if config.town_version > 1 else "p95")
         return {name: value for name, value in options.items() if name != "free_pose_share"} | share | {"slots": slots}
+    if isinstance(config, Osm):
+        return options | {"input": [make_absolute(path) for path in config.input]}
     return options | {"input": make_absolute(config.input)}
 
 
-def main(config: Town | Kitti360 | Av2 | Own) -> None:
+def main(config: Config) -> None:
     check_preprocess_scenes(config)
     options, shards = make_recorded_options(config), plan_shards(config)
     source = options["source"]
@@ -73,6 +96,8 @@ def main(config: Town | Kitti360 | Av2 | Own) -> None:
     if result.already_complete:
         print(f"{output} is already complete: {dict(result.scenes)}, {sum(result.rejects.values())} rejected")
         return
+    if notice := find_attribution(source):
+        print(f"licence of the data, which publications and exports must state: {notice}")
     total = sum(result.scenes.values())
     for reason, count in sorted(result.rejects.items(), key=lambda item: -item[1])[:10]:
         print(f"  rejected {count}: {reason}")

@@ -18,6 +18,7 @@ from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 
 Format = Literal["glb", "ply", "npz", "xodr", "geojson"]
+NOTICE = "NOTICE.txt"  # Licence notices of all exported scenes.
 WRITERS: dict[str, Callable[[Scene], bytes]] = {
     "glb": export_glb,
     "ply": export_ply,
@@ -37,7 +38,8 @@ def export_scenes(
     """Export each scene to output/<format>/<scene_id>.<format>; `make_file_name` replaces unsafe letters.
 
     A format may be unable to represent a scene; for example, OpenDRIVE needs roads. If a scene cannot be represented,
-    the table `rejects` of the output lists the scene, and the export continues.
+    the table `rejects` of the output lists the scene, and the export continues. NOTICE.txt in the output states the
+    licence notices of the scenes. Formats that have a place for it repeat the notice in each file.
 
     Args:
         selection: Scenes.
@@ -55,6 +57,7 @@ def export_scenes(
     def export_shard(number: int) -> dict:
         shard, rows = parts[number]
         written, rejects, paths = [], [], []
+        notices: set[str] = set()
         for scene in shard.scenes(rows):
             for kind in formats:
                 path = storage.join_uri(output, kind, f"{make_file_name(scene.scene_id)}.{kind}")
@@ -62,6 +65,7 @@ def export_scenes(
                     if path not in there:
                         content = WRITERS[kind](scene)
                         storage.write_whole(path, lambda stream, content=content: stream.write(content))
+                    notices |= {scene.attribution} if scene.attribution else set()
                     written.append(kind)
                     paths.append(path)
                 except ValueError as error:
@@ -71,18 +75,23 @@ def export_scenes(
             target = Shard(output, shard.source, shard.split, shard.number)
             storage.write_parquet(make_rejects_table(rejects), target.path("rejects"))
         refused = [(r["scene_id"], r["reason"]) for r in rejects]
-        return {"scenes": len(rows), "written": written, "paths": paths, "rejects": refused}
+        return {"scenes": len(rows), "written": written, "paths": paths, "rejects": refused, "notices": sorted(notices)}
 
     counts: dict[Format, int] = dict.fromkeys(formats, 0)
     refused: dict[str, str] = {}
     promised: list[str] = []
+    notices: set[str] = set()
     for row in map_tasks(export_shard, range(len(parts))):
         for kind in row["written"]:
             counts[kind] += 1
         promised += row["paths"]
+        notices.update(row["notices"])
         refused |= {scene_id: reason for scene_id, reason in row["rejects"]}
         if on_scene:
             on_scene(row["scenes"])
+    if notices:
+        text = "".join(f"{notice}\n" for notice in sorted(notices)).encode()
+        storage.write_whole(storage.join_uri(output, NOTICE), lambda stream: stream.write(text))
     there = list_exported(output, formats)
     storage.raise_faults({path: f"{path}: no such file" for path in promised if path not in there}, len(promised))
     return counts, refused

@@ -40,7 +40,8 @@ def export_geojson(scene: Scene) -> bytes:
         center_m, size_m = (np.round(v[index].astype(float), DECIMALS).tolist() for v in (scene.center_m, scene.size_m))
         yaw_rad = round(float(scene.yaw_rad[index]), 6)
         features.append(_make_feature(outline_m, **about, center_m=center_m, size_m=size_m, yaw_rad=yaw_rad))
-    collection = {"type": "FeatureCollection", "name": scene.scene_id, "unit": "m", "features": features}
+    notice = {"attribution": scene.attribution} if scene.attribution else {}
+    collection = {"type": "FeatureCollection", "name": scene.scene_id, "unit": "m", **notice, "features": features}
     return json.dumps(collection, ensure_ascii=False).encode()
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 from uuid import uuid4
@@ -209,6 +209,8 @@ def export_glb(scene: Scene) -> bytes:
         Content of the .glb file.
     """
     about = {name: getattr(scene, name) for name in ABOUT} | {"grid": asdict(scene.grid)}
+    if scene.attribution:
+        about["attribution"] = scene.attribution
     world = trimesh.Scene(metadata=about)
     world.graph.update("scene", "world", matrix=GLTF_FROM_SCENE)
     vertices, triangles, class_id = build_painted_ground(scene)
@@ -222,11 +224,13 @@ def export_glb(scene: Scene) -> bytes:
         name = CATEGORIES[scene.category[index]]
         node = f"{name}_{index:04d}"
         world.graph.update(node, "scene", matrix=transform, geometry=name, metadata=_make_extras(scene, index))
-    return trimesh.exchange.gltf.export_glb(world, tree_postprocessor=_set_buffer_targets)
+    return trimesh.exchange.gltf.export_glb(world, tree_postprocessor=partial(_complete_tree, scene.attribution))
 
 
-def _set_buffer_targets(tree: dict) -> None:
-    """Set the glTF hints that tell the GPU whether a buffer view holds vertices or indices."""
+def _complete_tree(attribution: str | None, tree: dict) -> None:
+    """Set the licence notice, and hints that tell the GPU whether a buffer view holds vertices or indices."""
+    if attribution:
+        tree["asset"]["copyright"] = attribution
     for mesh in tree.get("meshes", ()):
         for part in mesh["primitives"]:
             targets = {index: ARRAY_BUFFER for index in part["attributes"].values()}
@@ -260,7 +264,13 @@ def export_ply(scene: Scene) -> bytes:
         np.concatenate(vertices), np.concatenate(faces), vertex_colors=CLASS_COLORS[class_id], process=False
     )
     mesh.vertex_attributes = {"class_id": class_id, "primitive": np.concatenate(primitives).astype(np.int32)}
-    return trimesh.exchange.ply.export_ply(mesh)
+    content = trimesh.exchange.ply.export_ply(mesh)
+    if not scene.attribution:
+        return content
+    first, rest = content.split(b"\n", 1)
+    form, rest = rest.split(b"\n", 1)
+    notice = scene.attribution.encode("ascii", "replace").replace(b"\n", b" ")
+    return b"\n".join([first, form, b"comment " + notice, rest])
 
 
 def write_glb(scene: Scene, path: str | Path) -> None:

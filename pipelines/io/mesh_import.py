@@ -123,6 +123,7 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
         about["source"],
         about["sequence"],
         about["split"],
+        about.get("attribution", ""),
     ):
         if len(text) > letters:
             require_within("text_characters", len(text), "a label or an id")
@@ -253,14 +254,19 @@ def _read_metadata(extras: dict) -> dict[str, Any]:
     if not all(label is None or label in DENSITIES for label in densities.values()):
         raise ValueError(f"{place}: a density label is none of {', '.join(DENSITIES)}; export it again")
     x, y, z = _read_numbers(extras, "world_xyz_m", 3, place, -1e9, 1e9)
-    return densities | {
-        **{name: _read_text(extras, name, place) for name in TEXTS},
-        "frame": _read_integer(extras, "frame", place),
-        "world_xyz_m": (x, y, z),
-        "world_yaw_rad": _read_number(extras, "world_yaw_rad", place, -1e6, 1e6),
-        "grid": Grid(front_m, left_m, resolution_m, rows, cols),
-        "ground_classes": tuple(classes),
-    }
+    notice = {"attribution": _read_text(extras, "attribution", place)} if extras.get("attribution") else {}
+    return (
+        densities
+        | notice
+        | {
+            **{name: _read_text(extras, name, place) for name in TEXTS},
+            "frame": _read_integer(extras, "frame", place),
+            "world_xyz_m": (x, y, z),
+            "world_yaw_rad": _read_number(extras, "world_yaw_rad", place, -1e6, 1e6),
+            "grid": Grid(front_m, left_m, resolution_m, rows, cols),
+            "ground_classes": tuple(classes),
+        }
+    )
 
 
 def _require(extras: dict, name: str, place: str) -> Any:

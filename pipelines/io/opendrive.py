@@ -254,6 +254,8 @@ def _make_header(root: ET.Element, scene: Scene) -> None:
         z=_format_number(z),
         hdg=_format_number(scene.world_yaw_rad),
     )
+    if scene.attribution:
+        ET.SubElement(header, "userData", code="attribution", value=scene.attribution)
 
 
 def _format_number(value: float) -> str:

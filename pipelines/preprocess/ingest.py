@@ -25,6 +25,7 @@ from pipelines.preprocess.sharding import ShardTask
 from pipelines.preprocess.sources.drive import Drive
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import MAX_RETRIES, map_rows
+from pipelines.schema.attribution import find_attribution
 from pipelines.schema.columns import SCENE_TABLES, SCHEMA_VERSION
 from pipelines.schema.dataset import DESCRIPTION, Statistics, compute_training_statistics, label_scenes
 from pipelines.schema.run_guard import compare_options
@@ -214,7 +215,7 @@ def ingest_drives(
         totals[manifest["split"]] += manifest["scenes"]
         reasons.update(manifest["rejects"])
     reports = {sequence: report for m in manifests for sequence, report in m["reports"].items() if report}
-    duplicates = sum(report["duplicates"] for report in reports.values())
+    duplicates = sum(report.get("duplicates", 0) for report in reports.values())
     content = {
         "schema_version": SCHEMA_VERSION,
         "source": tasks[0].source,
@@ -227,6 +228,8 @@ def ingest_drives(
         "vehicle_thresholds": asdict(statistics.vehicle),
         "reports": reports,
     }
+    if attribution := find_attribution(tasks[0].source):
+        content["attribution"] = attribution
     storage.write_json(content, description)
     storage.delete_directory(staging)
     return IngestResult(totals, reasons, duplicates, time.perf_counter() - started)

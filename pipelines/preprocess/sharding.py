@@ -9,8 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.preprocess.sources import argoverse2, custom, kitti360
+from pipelines.preprocess.sources.osm.extract import list_extracts
+from pipelines.preprocess.sources.osm.reader import SOURCE as OSM
+from pipelines.preprocess.sources.osm.reader import OsmOptions, read_places
 from pipelines.preprocess.sources.town import generator
-from pipelines.schema.splits import ARGOVERSE2_SPLIT, TEST, TRAIN, UNUSED, make_no_split, split_poses
+from pipelines.schema.splits import ARGOVERSE2_SPLIT, TEST, TRAIN, UNUSED, make_no_split, split_poses, split_squares
 from pipelines.schema.tables import Shard
 
 SHARD_SCENES = 256
@@ -136,6 +139,33 @@ def plan_custom(root: str, split: bool = True, skip_unreadable: bool = False) ->
     classes = custom.read_ground_classes(root)
     keys = {name: (root, name, classes) for name in [*poses, *unreadable]}
     return _plan_drives("own", keys, {name: frame for name, (frame, _) in poses.items()}, labels)
+
+
+def plan_osm(inputs: tuple[str, ...], options: OsmOptions, test_share: float) -> list[ShardTask]:
+    """Plan tasks of at most SHARD_SCENES poses of one extract of OpenStreetMap and one split.
+
+    Args:
+        inputs: Extracts, or directories of extracts.
+        options: Options of the reader.
+        test_share: Share of the area whose poses get the split test.
+
+    Returns:
+        The tasks.
+
+    Raises:
+        ValueError: A file cannot be read, no street lies in the region, or no training scene remains.
+    """
+    keys, frames, labels = {}, {}, {}
+    for path in list_extracts(inputs):
+        name, places = read_places(path, options)
+        keys[name], frames[name] = (path, options), np.arange(len(places.xy_m))
+        labels[name] = split_squares(places.xy_m, places.yaw_rad, test_share)
+    if not any((split == TRAIN).any() for split in labels.values()):
+        raise ValueError(
+            f"--test-share {test_share:g} leaves no training scene, because crops near test squares are not used; "
+            "specify a smaller share, or 0 for a place of less than 1 km"
+        )
+    return _plan_drives(OSM, keys, frames, labels)
 
 
 def plan_argoverse2(root: str) -> list[ShardTask]:

@@ -17,7 +17,7 @@ TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
 SCENE_TABLES = ("scenes", "primitives", "rasters")  # Tables that every shard has.
 TEXTS = ("scene_id", "category", "label", "kind")  # Text columns of the table `primitives`.
 SCHEMA_VERSION = "1"  # Version of the column names and types. Descriptions may change within a version.
-DEFAULTS = {"free_pose": "false"}  # JSON value of columns that earlier versions did not write.
+DEFAULTS = {"free_pose": "false", "attribution": "null"}  # JSON value of columns that earlier versions did not write.
 HEIGHT_STEP_M = 0.01
 MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # Largest height (m) that a 16-bit integer can store.
 
@@ -100,8 +100,10 @@ SCENES = _make_schema(
      "Full pose in the source dataset, a 3 x 4 matrix row by row with the translation (m) in its last column; or "
      "null."),
     ("free_pose",            pa.bool_(),   "",
-     "Whether the scene is a crop at any place and heading (town of version 2); false for the view of a vehicle and "
-     "in files of earlier versions."),
+     "Whether the scene is a crop at any place and heading (town of version 2, osm); false for the view of a vehicle "
+     "and in files of earlier versions."),
+    ("attribution",          pa.string(),  "",
+     "Licence notice that copies of the scene must state, such as that of OpenStreetMap; null if there is none."),
     ("vegetation_density",   pa.string(),  "",
      "low, medium or high, by number and volume of vegetation; for generated scenes, the requested label or null."),
     ("vehicle_density",      pa.string(),  "",

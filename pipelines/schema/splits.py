@@ -18,6 +18,11 @@ REMOVAL_M = 5.0
 # has at least 50 m: 25 m for test poses with margins, and 25 m for training poses.
 MIN_SEGMENT_M = 50.0
 
+# Squares of maps: all poses of a test square are test poses.
+SQUARE_M = 400.0
+CROP_AHEAD_M = 32.0  # Distance from a pose to the middle of its crop.
+CROP_REACH_M = 2 * 32.0 * 2**0.5  # Crops whose middles are farther apart than this do not overlap.
+
 # Argoverse 2 is split by log; its test logs have no annotations.
 ARGOVERSE2_SPLIT = {"train": TRAIN, "val": TEST}
 
@@ -72,6 +77,38 @@ def make_no_split(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.
         (p,) str per sequence, all "train".
     """
     return {sequence: np.full(len(p), TRAIN, object) for sequence, p in positions_by_sequence.items()}
+
+
+def split_squares(xy_m: np.ndarray, yaw_rad: np.ndarray, test_share: float) -> np.ndarray:
+    """Split poses of a map by squares of SQUARE_M.
+
+    Randomly chosen squares with at most `test_share` of the poses become test squares. Training poses whose crops may
+    overlap the crop of a test pose become unused.
+
+    Args:
+        xy_m: (p, 2) positions (m).
+        yaw_rad: (p,) headings.
+        test_share: Largest share of poses in test squares.
+
+    Returns:
+        (p,) str: train, test or unused.
+    """
+    labels = np.full(len(xy_m), TRAIN, object)
+    middle_m = xy_m + CROP_AHEAD_M * np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=1)
+    squares, owner = np.unique(np.floor(middle_m / SQUARE_M).astype(np.int64), axis=0, return_inverse=True)
+    owner = owner.reshape(-1)
+    count = np.bincount(owner, minlength=len(squares))
+    chosen, room = [], test_share * len(xy_m)
+    for square in np.random.default_rng(0).permutation(len(squares)).tolist():
+        if count[square] <= room:
+            chosen.append(square)
+            room -= count[square]
+    labels[np.isin(owner, chosen)] = TEST
+    test, train = np.flatnonzero(labels == TEST), np.flatnonzero(labels == TRAIN)
+    if len(test) and len(train):
+        distance_m, _ = cKDTree(middle_m[test]).query(middle_m[train], distance_upper_bound=CROP_REACH_M)
+        labels[train[np.isfinite(distance_m)]] = UNUSED
+    return labels
 
 
 def count_segments(total_m: float) -> int:

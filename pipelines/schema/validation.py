@@ -79,6 +79,15 @@ def encode_texts(column: pa.ChunkedArray) -> tuple[pa.Array, np.ndarray]:
 
 def _require_texts(table: pa.Table, name: str) -> None:
     _require_present(table, name)
+    _require_short_texts(table, name)
+
+
+def _require_optional_texts(table: pa.Table, name: str) -> None:
+    if table[name].null_count < len(table):
+        _require_short_texts(pa.table({name: pc.fill_null(table[name], "")}), name)
+
+
+def _require_short_texts(table: pa.Table, name: str) -> None:
     texts, index = encode_texts(table[name])
     limit = find_limit("text_characters")
     if (pc.max(pc.binary_length(texts)).as_py() or 0) <= limit:  # A letter has at least one byte.
@@ -197,6 +206,7 @@ RULES: Mapping[str, Mapping[str, Callable[[pa.Table, str], None]]] = {
         **dict.fromkeys(("x_m", "y_m", "z_m", "yaw_rad"), _FINITE),
         "world_from_imu": _validate_poses,
         "free_pose": _require_present,
+        "attribution": _require_optional_texts,
         **dict.fromkeys(("vegetation_density", "vehicle_density"), _make_choice_rule(DENSITIES, is_optional=True)),
         **dict.fromkeys(("vegetation_volume_m3", "vehicle_volume_m3"), _COUNT),
         **dict.fromkeys(("num_primitives", *(f"num_{name}" for name in CATEGORIES), "primitive_offset"), _COUNT),

@@ -7,9 +7,12 @@ from pathlib import Path
 import duckdb
 import numpy as np
 import pytest
+from osm_map import make_town_street
 
-from jobs.implementation.preprocess_scenes import SLOTS
+from jobs.implementation.preprocess_scenes import SLOTS, main
+from jobs.preprocess_scenes import Osm
 from models.scene import CATEGORIES, Grid
+from pipelines.io.export import export_scenes
 from pipelines.preprocess import ingest
 from pipelines.preprocess.shard_writer import ShardCut, write_shard
 from pipelines.preprocess.sharding import plan_argoverse2, plan_kitti360, plan_town
@@ -17,8 +20,10 @@ from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.town.generator import generate_town, select_poses, write_kitti360
 from pipelines.runtime import storage
 from pipelines.runtime.machines import identify_machine
+from pipelines.schema.attribution import ATTRIBUTIONS
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.density_labels import classify_density, compute_density_thresholds
+from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import find_shards, read_scenes
 
 
@@ -207,3 +212,25 @@ def test_preprocess_rejects_empty_training_split(cluster, tmp_path):
     only_test = [task for task in plan_town(24, 8, 0) if task.split == "test"]
     with pytest.raises(ValueError, match="the training split is empty"):
         ingest.ingest_drives(only_test, str(tmp_path), {})
+
+
+def test_preprocess_reads_openstreetmap_and_exports_notice(cluster, tmp_path):
+    path = make_town_street().write(tmp_path / "place.osm")
+    root = str(tmp_path / "osm")
+    job = Osm(input=(path,), output=root, furnish=True, test_share=0.0)
+    main(job)
+    description = storage.read_json(storage.join_uri(root, "dataset.json"))
+    assert description["attribution"] == ATTRIBUTIONS["osm"] and description["reports"]["place"]["buildings"] == 40
+    marked, mapped = query_table(
+        tmp_path / "osm",
+        "select count(*) filter (label like 'furnished %'), count(*) filter (label = 'building') from TABLE",
+        "primitives",
+    )[0]
+    assert marked > 500 and mapped > 100
+    splits = dict(query_table(tmp_path / "osm", "select split, count(*) from TABLE group by split"))
+    assert set(splits) == {"train"} and splits["train"] > 80
+    (notice,) = query_table(tmp_path / "osm", "select distinct attribution from TABLE")[0]
+    assert notice == ATTRIBUTIONS["osm"]
+    counts, refused = export_scenes(SceneSubset(root, limit=2), ["glb", "npz"], str(tmp_path / "files"))
+    assert counts == {"glb": 2, "npz": 2} and not refused
+    assert (tmp_path / "files" / "NOTICE.txt").read_text() == f"{ATTRIBUTIONS['osm']}\n"

@@ -16,8 +16,10 @@ import numpy as np
 from models.limits import require_within
 from models.scene import Grid, Scene, canonicalize_boxes, make_yaw_rotation
 from pipelines.geometry.rasterize import fill_polygon, rasterize_heights
+from pipelines.schema.attribution import find_attribution
 
 STATIC = -1
+HIDDEN = -1  # Layer of LayeredGround without a ground class.
 PART_PIXELS = 2**22  # Pixels of the bounding boxes of the triangles that are rasterised together.
 EXTRUSION_M = 1e-3  # Maximum deviation of a slab's underside from a shifted copy of its top.
 
@@ -269,6 +271,62 @@ class SurfaceGround:
         return _rasterize_triangles(pose.to_ego(seen.triangles_m), grid, seen.triangle_class, num_classes)
 
 
+@dataclass(frozen=True, eq=False)
+class LayeredGround:
+    """Ground as layers of triangles, of which the uppermost counts at each place (maps).
+
+    Attributes:
+        triangles_m: Corners in the world frame (m).
+        triangle_layer: Index of each triangle's layer.
+        layer_class: Index of each layer's class in the drive's ground_classes, from the top layer to the bottom layer;
+            HIDDEN for layers without a class, such as buildings and water, which hide the layers below them.
+    """
+
+    triangles_m: np.ndarray  # (t, 3, 3) float64
+    triangle_layer: np.ndarray  # (t,)
+    layer_class: tuple[int, ...]
+
+    def near(self, low_m: np.ndarray, high_m: np.ndarray) -> LayeredGround:
+        """Select the triangles whose bounding box intersects a rectangle.
+
+        Args:
+            low_m: (2,) lower corner in the world frame (m).
+            high_m: (2,) upper corner in the world frame (m).
+
+        Returns:
+            The ground with only these triangles.
+        """
+        seen = SurfaceGround(self.triangles_m, self.triangle_layer).near(low_m, high_m)
+        return replace(self, triangles_m=seen.triangles_m, triangle_layer=seen.triangle_class)
+
+    def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Rasterise the layers at pixel centres. Each pixel has at most one class.
+
+        Args:
+            pose: Ego pose of the scene.
+            grid: Raster grid in the scene frame.
+            num_classes: Number G of ground classes.
+
+        Returns:
+            height_m (G, H, W) float32 in the scene frame (m), and occupied (G, H, W) bool.
+
+        Raises:
+            LimitError: The ground exceeds the limit scene_coverage.
+        """
+        surface = SurfaceGround(self.triangles_m, self.triangle_layer)
+        layer_height, covered = surface.rasterise(pose, grid, len(self.layer_class))
+        height = np.zeros((num_classes, grid.rows, grid.cols), np.float32)
+        occupied = np.zeros(height.shape, bool)
+        free = np.ones(height.shape[1:], bool)
+        for layer, index in enumerate(self.layer_class):
+            if index != HIDDEN:
+                seen = covered[layer] & free
+                height[index][seen] = layer_height[layer][seen]
+                occupied[index] |= seen
+            free &= ~covered[layer]
+        return height, occupied
+
+
 def _rasterize_triangles(
     triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, num_layers: int
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -349,7 +407,7 @@ class Drive:
     label: np.ndarray  # (n,) str objects
     timestamp: np.ndarray  # (n,) int64
     ground_classes: tuple[str, ...]
-    ground: SlabGround | MapGround | SurfaceGround
+    ground: SlabGround | MapGround | SurfaceGround | LayeredGround
     frame: np.ndarray  # (p,) int64
     world_from_imu: np.ndarray  # (p, 3, 4)
     free_pose: np.ndarray | None = None  # (p,) bool
@@ -449,4 +507,5 @@ class Drive:
             world_yaw_rad=pose.yaw_rad,
             world_from_imu=self.world_from_imu[index],
             free_pose=self.free_pose is not None and bool(self.free_pose[index]),
+            attribution=find_attribution(self.source),
         )

@@ -152,8 +152,8 @@ def _build_side(site: Site, block: CityBlock, k: int, sides: list[Side], cuts: l
     if not side.sidewalk:
         plant_strip(site.sheet, frame, "ground", start, end, paved_to, side.depth, piece)
     if not side.bay:
-        _park_cars(site, frame, start + 4.0, end - 4.0, k, side)
-    _add_furniture(site, frame, start, end, k, side, bool(r0))
+        park_cars(site, frame, start + 4.0, end - 4.0, k, side)
+    add_furniture(site, frame, start, end, k, side, bool(r0))
 
 
 def _build_corner(
@@ -187,7 +187,7 @@ def _build_bays(site: Site, frame: LocalFrame, start: float, end: float, paved: 
         s += gap
 
 
-def _park_cars(site: Site, frame: LocalFrame, start: float, end: float, k: int, side: Side) -> None:
+def park_cars(site: Site, frame: LocalFrame, start: float, end: float, k: int, side: Side) -> None:
     """Park a row of cars along the kerb, in the direction of the adjacent lane."""
     rng, district = site.rng, site.district
     slots = int(max(0.0, end - start) / CAR_SLOT_M)
@@ -212,7 +212,7 @@ def _park_cars(site: Site, frame: LocalFrame, start: float, end: float, k: int, 
         site.sheet.boxes(frame, label, big[:1], -1.5, size, np.pi)
 
 
-def _add_furniture(site: Site, frame: LocalFrame, start: float, end: float, k: int, side: Side, corner0: bool) -> None:
+def add_furniture(site: Site, frame: LocalFrame, start: float, end: float, k: int, side: Side, corner0: bool) -> None:
     """Add lamps at regular distances, signs near junctions, traffic lights, rows of trees and pedestrians."""
     rng, district, variation = site.rng, site.district, site.variation
     length, walk = max(0.0, end - start), side.depth if side.sidewalk else 1.3  # On a verge, poles stand near the road.
