@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from jobs.implementation.checks import check_inpaint_scenes
 from jobs.inpaint_scenes import Config
+from jobs.support.inpainting_requests import make_execution, make_inpainting_config
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
-from jobs.support.scene_requests import make_execution, make_inpainting_config, select_scenes
+from jobs.support.scene_requests import select_scenes
 from pipelines.generation.inpaint import InpaintRequest, RegionConfig, inpaint_scenes
 
 

@@ -13,10 +13,11 @@ from rich.progress import MofNCompleteColumn, Progress
 from jobs.implementation.checks import check_outpaint_scenes
 from jobs.outpaint_scenes import Config
 from jobs.support.cli import make_absolute
+from jobs.support.inpainting_requests import make_execution, make_inpainting_config
 from jobs.support.model_directories import find_pipeline_directory, read_label_kind
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
-from jobs.support.scene_requests import make_execution, make_inpainting_config, select_scenes
+from jobs.support.scene_requests import select_scenes
 from models.composition.block_grid import Arrangement, choose_arrangement, label_blocks
 from models.composition.outpaint import MIN_KNOWN_GROUND
 from models.composition.road_sketch import RoadMap, SketchedRoad

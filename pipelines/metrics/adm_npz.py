@@ -17,11 +17,11 @@ import numpy as np
 
 from models.limits import require_within
 from pipelines.metrics.frechet import StoredGaussian
-from pipelines.metrics.inception import FEATURES, SPATIAL_FEATURES
 from pipelines.runtime.npz import ArrayHeader, NpzArchive, open_npz
 from pipelines.runtime.storage import write_whole
 
 PICTURES = "arr_0"
+FEATURES, SPATIAL_FEATURES = 2048, 2023  # Dimensions of the pool3 features and of the spatial features.
 ASYMMETRY = 1e-3  # Largest accepted asymmetry of a covariance, relative to its largest entry.
 LARGEST = 1e30  # Largest accepted number in moments; products of such numbers are finite.
 

@@ -9,15 +9,16 @@ import shlex
 import subprocess
 import sys
 from functools import lru_cache
+from importlib.metadata import version
 from pathlib import Path
-
-import torch
 
 ROOT = Path(__file__).parents[2]
 
 
 def describe_machine() -> str:
     """Return the processor, cores, memory and GPUs, such as "AMD EPYC, 2 cores, 24 GiB"."""
+    import torch  # Jobs without models do not need this module, whose import takes two seconds.
+
     information = Path("/proc/cpuinfo")
     lines = information.read_text().splitlines() if information.exists() else []
     processor = next((line.split(":")[1].strip() for line in lines if "model name" in line), platform.machine())
@@ -72,4 +73,4 @@ def format_command() -> str:
 
 def list_versions() -> str:
     """Return the versions of Python and torch."""
-    return f"Python {platform.python_version()}, torch {torch.__version__}"
+    return f"Python {platform.python_version()}, torch {version('torch')}"

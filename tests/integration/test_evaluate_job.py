@@ -80,6 +80,7 @@ def test_evaluate_rejects_images_of_another_size(smoke, tmp_path):
         )
 
 
+@pytest.mark.slow
 def test_scene_features_are_unchanged_by_worker_kill(smoke, tmp_path):
     """The test kills the worker as soon as the job has written the first part."""
     dataset = Dataset.open(str(smoke / "datasets/smoke"))

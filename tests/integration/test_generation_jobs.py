@@ -330,6 +330,7 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
     assert outward["ahead"] == 1
 
 
+@pytest.mark.slow
 def test_outpaint_follows_a_street_plan(smoke, tmp_path):
     from models.composition.road_sketch import RoadMap
     from models.pipeline import PrITTIPipeline

@@ -296,6 +296,7 @@ def test_missing_bucket_is_named_when_scenes_are_read(s3):
         find_shards(root)
 
 
+@pytest.mark.slow
 def test_generated_and_edited_scenes_in_s3_equal_local(s3, cache, tmp_path):
     from jobs.edit_scenes import Translate
     from jobs.implementation.edit_scenes import edit_scenes

@@ -55,6 +55,7 @@ def test_paper_pr_compares_exact_numbers_with_a_ceiling(data, tmp_path):
         evaluate(replace(base, generated=str(tmp_path / "few.npz"), output=str(tmp_path / "b")))
 
 
+@pytest.mark.slow
 def test_paper_fid_streams_all_training_scenes(data, tmp_path):
     total = count_training_scenes(data)
     write_npz(str(tmp_path / "few.npz"), [render_scenes(data, total - 1)], total - 1)
@@ -93,6 +94,7 @@ def test_paper_nearest_computes_only_distances_of_vgg16(data, tmp_path, monkeypa
     assert "supplement G" in (tmp_path / "a/evaluation.html").read_text()
 
 
+@pytest.mark.slow
 def test_pdd_drops_and_counts_blank_pictures(data, tmp_path):
     pictures = render_scenes(data, 9)
     pictures[2] = 255
