@@ -6,6 +6,7 @@
     jobs/preprocess_scenes.py kitti360 --input KITTI-360 --output DIR
     jobs/preprocess_scenes.py av2 --input AV2 --output DIR
     jobs/preprocess_scenes.py osm --input city.osm.pbf --origin 52.474 13.440 --radius-m 500 --output DIR
+    jobs/preprocess_scenes.py opendrive --input town.xodr --output DIR
     jobs/preprocess_scenes.py own --input DRIVES --output DIR             your own drives: docs/how_to/own_drives.md
 
 The job writes the tables scenes, primitives, rasters and rejects, and dataset.json. Run the same command again to
@@ -101,7 +102,7 @@ class Osm:
     free_pose_share: float = 0.25
     """Share of the scenes that are crops at any place and heading, instead of views of a vehicle."""
     test_share: float = 0.1
-    """Share of the scenes that lie in test squares of 400 m."""
+    """Largest share of the scenes that lie in test squares of 400 m."""
     drive_on: Literal["right", "left"] = "right"
     """Side of the road on which vehicles drive."""
     furnish: bool = False
@@ -109,6 +110,25 @@ class Osm:
     The labels of added objects begin with "furnished"."""
     seed: int = 0
     """Random seed of free poses and added objects."""
+    slots: Literal["p95", "p99.5", "paper"] = "p99.5"
+    """Rule for the number of slots per category: a percentile over the training split, or the paper's 514 slots in
+    total. Models do not learn objects beyond these slots."""
+
+
+@dataclass(frozen=True)
+class OpenDrive:
+    """Read OpenDRIVE files: lanes, junctions, objects and signals (docs/how_to/real_places.md)."""
+
+    input: tuple[str, ...]
+    """OpenDRIVE files (.xodr or .xodr.gz), or directories of such files."""
+    output: str = ""
+    """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/opendrive)."""
+    if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
+    spacing_m: float = 10.0
+    """Distance between successive poses along a lane."""
+    test_share: float = 0.1
+    """Largest share of the scenes that lie in test squares of 400 m."""
     slots: Literal["p95", "p99.5", "paper"] = "p99.5"
     """Rule for the number of slots per category: a percentile over the training split, or the paper's 514 slots in
     total. Models do not learn objects beyond these slots."""
@@ -138,6 +158,7 @@ Config = (
     | Annotated[Kitti360, tyro.conf.subcommand("kitti360")]
     | Annotated[Av2, tyro.conf.subcommand("av2")]
     | Annotated[Osm, tyro.conf.subcommand("osm")]
+    | Annotated[OpenDrive, tyro.conf.subcommand("opendrive")]
     | Annotated[Own, tyro.conf.subcommand("own")]
 )
 DEFAULT = Town()  # source if the command line does not name a source

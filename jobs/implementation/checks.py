@@ -11,7 +11,7 @@ from jobs.evaluate_scenes import Config as EvaluateConfig
 from jobs.implementation.protocols import PROTOCOLS, apply_protocol
 from jobs.inpaint_scenes import Config as InpaintConfig
 from jobs.outpaint_scenes import Config as OutpaintConfig
-from jobs.preprocess_scenes import Av2, Kitti360, Osm, Own, Town
+from jobs.preprocess_scenes import Av2, Kitti360, OpenDrive, Osm, Own, Town
 from jobs.publish_model import Config as PublishConfig
 from jobs.sample_scenes import Config as SampleConfig
 from jobs.support.cli import home_path, make_absolute, require_positive, resolve_path
@@ -130,7 +130,7 @@ def check_encode_latents(config: EncodeConfig) -> None:
     Dataset.open(resolve_path(config.dataset, "datasets", "town"))
 
 
-def check_preprocess_scenes(config: Town | Kitti360 | Av2 | Osm | Own) -> None:
+def check_preprocess_scenes(config: Town | Kitti360 | Av2 | Osm | OpenDrive | Own) -> None:
     if isinstance(config, Town) and config.free_pose_share is not None:
         if not 0 <= config.free_pose_share <= 1:
             raise ValueError(f"--free-pose-share is {config.free_pose_share}, expected a share between 0 and 1")
@@ -139,17 +139,21 @@ def check_preprocess_scenes(config: Town | Kitti360 | Av2 | Osm | Own) -> None:
                 f"--free-pose-share is {config.free_pose_share}, but town version 1 has no free poses; "
                 "add --town-version 2"
             )
-    if isinstance(config, Osm):
-        check_osm(config)
+    if isinstance(config, Osm | OpenDrive):
+        check_map(config)
     elif not isinstance(config, Town) and not storage.exists(make_absolute(config.input)):
         raise ValueError(f"--input {config.input}: no such directory; specify the root directory of the dataset")
 
 
-def check_osm(config: Osm) -> None:
-    require_positive(config, "spacing_m", "radius_m")
-    if config.bbox is not None and config.origin is not None:
-        raise ValueError("--bbox and --origin are both given; specify the region with one of them")
-    for name, largest in (("free_pose_share", 0.9), ("test_share", 0.5)):
+def check_map(config: Osm | OpenDrive) -> None:
+    require_positive(config, "spacing_m")
+    shares = {"test_share": 0.5}
+    if isinstance(config, Osm):
+        require_positive(config, "radius_m")
+        if config.bbox is not None and config.origin is not None:
+            raise ValueError("--bbox and --origin are both given; specify the region with one of them")
+        shares["free_pose_share"] = 0.9
+    for name, largest in shares.items():
         value = getattr(config, name)
         if not 0 <= value <= largest:
             raise ValueError(f"--{name.replace('_', '-')} is {value:g}, expected 0 to {largest:g}")

@@ -7,13 +7,14 @@ from dataclasses import asdict
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from jobs.implementation.checks import check_preprocess_scenes
-from jobs.preprocess_scenes import Av2, Kitti360, Osm, Own, Town
+from jobs.preprocess_scenes import Av2, Kitti360, OpenDrive, Osm, Own, Town
 from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from models.layout import PAPER_SLOTS
 from pipelines.preprocess import sharding
 from pipelines.preprocess.ingest import ingest_drives
+from pipelines.preprocess.sources.opendrive.reader import OpenDriveOptions
 from pipelines.preprocess.sources.osm.extract import Region
 from pipelines.preprocess.sources.osm.reader import OsmOptions
 from pipelines.schema.attribution import find_attribution
@@ -30,7 +31,7 @@ def find_free_pose_share(config: Town) -> float:
     return default if config.free_pose_share is None else config.free_pose_share
 
 
-Config = Town | Kitti360 | Av2 | Osm | Own
+Config = Town | Kitti360 | Av2 | Osm | OpenDrive | Own
 
 
 def make_osm_options(config: Osm) -> OsmOptions:
@@ -53,6 +54,9 @@ def plan_shards(config: Config) -> list:
     if isinstance(config, Osm):
         inputs = tuple(make_absolute(path) for path in config.input)
         return sharding.plan_osm(inputs, make_osm_options(config), config.test_share)
+    if isinstance(config, OpenDrive):
+        inputs = tuple(make_absolute(path) for path in config.input)
+        return sharding.plan_opendrive(inputs, OpenDriveOptions(config.spacing_m), config.test_share)
     root = make_absolute(config.input)
     if isinstance(config, Av2):
         return sharding.plan_argoverse2(root)
@@ -69,7 +73,7 @@ def make_recorded_options(config: Config) -> dict:
         share = {"free_pose_share": find_free_pose_share(config)} if config.town_version > 1 else {}
         slots = config.slots or ("p99.5" if config.town_version > 1 else "p95")
         return {name: value for name, value in options.items() if name != "free_pose_share"} | share | {"slots": slots}
-    if isinstance(config, Osm):
+    if isinstance(config, Osm | OpenDrive):
         return options | {"input": [make_absolute(path) for path in config.input]}
     return options | {"input": make_absolute(config.input)}
 

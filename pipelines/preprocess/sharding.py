@@ -9,6 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.preprocess.sources import argoverse2, custom, kitti360
+from pipelines.preprocess.sources.opendrive.file import list_maps
+from pipelines.preprocess.sources.opendrive.reader import SOURCE as OPENDRIVE
+from pipelines.preprocess.sources.opendrive.reader import OpenDriveOptions, read_poses
 from pipelines.preprocess.sources.osm.extract import list_extracts
 from pipelines.preprocess.sources.osm.reader import SOURCE as OSM
 from pipelines.preprocess.sources.osm.reader import OsmOptions, read_places
@@ -160,12 +163,39 @@ def plan_osm(inputs: tuple[str, ...], options: OsmOptions, test_share: float) ->
         name, places = read_places(path, options)
         keys[name], frames[name] = (path, options), np.arange(len(places.xy_m))
         labels[name] = split_squares(places.xy_m, places.yaw_rad, test_share)
+    _require_training_scenes(labels, test_share)
+    return _plan_drives(OSM, keys, frames, labels)
+
+
+def _require_training_scenes(labels: dict[str, np.ndarray], test_share: float) -> None:
     if not any((split == TRAIN).any() for split in labels.values()):
         raise ValueError(
             f"--test-share {test_share:g} leaves no training scene, because crops near test squares are not used; "
             "specify a smaller share, or 0 for a place of less than 1 km"
         )
-    return _plan_drives(OSM, keys, frames, labels)
+
+
+def plan_opendrive(inputs: tuple[str, ...], options: OpenDriveOptions, test_share: float) -> list[ShardTask]:
+    """Plan tasks of at most SHARD_SCENES poses of one OpenDRIVE file and one split.
+
+    Args:
+        inputs: OpenDRIVE files, or directories of such files.
+        options: Options of the reader.
+        test_share: Share of the scenes in test squares.
+
+    Returns:
+        The tasks.
+
+    Raises:
+        ValueError: A file cannot be read, it has no driving lane, or no training scene remains.
+    """
+    keys, frames, labels = {}, {}, {}
+    for path in list_maps(inputs):
+        name, poses = read_poses(path, options)
+        keys[name], frames[name] = (path, options), np.arange(len(poses.yaw_rad))
+        labels[name] = split_squares(poses.xyz_m[:, :2], poses.yaw_rad, test_share)
+    _require_training_scenes(labels, test_share)
+    return _plan_drives(OPENDRIVE, keys, frames, labels)
 
 
 def plan_argoverse2(root: str) -> list[ShardTask]:
