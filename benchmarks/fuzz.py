@@ -36,7 +36,8 @@ import tyro
 HANG_S, LIMIT_BYTES, ADDRESS_SPACE_BYTES = 10.0, 2 * 2**30, 12 * 2**30
 VERDICTS = ("refused", "accepted", "different", "exception", "hang", "memory")
 NAMES = (
-    "tables", "glb-own", "glb-foreign", "voxels", "adm", "kitti360", "argoverse2", "custom", "edits", "models",
+    "tables", "glb-own", "glb-foreign", "voxels", "adm", "kitti360", "argoverse2", "custom", "osm", "opendrive",
+    "edits", "models",
 )  # fmt: skip
 
 

@@ -52,10 +52,13 @@ from pipelines.editing.edit import parse_edits
 from pipelines.io.gltf_reader import place_parts, read_glb
 from pipelines.io.mesh_export import export_glb
 from pipelines.io.mesh_import import import_glb
+from pipelines.io.opendrive import export_opendrive
 from pipelines.io.voxel_import import read_voxels
 from pipelines.metrics.adm_npz import iterate_pictures, read_picture_shape, read_reference_moments
 from pipelines.preprocess.sources import argoverse2, custom, kitti360
 from pipelines.preprocess.sources.drive import Drive
+from pipelines.preprocess.sources.opendrive import reader as opendrive
+from pipelines.preprocess.sources.osm import reader as osm
 from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
 from pipelines.runtime import storage
 from pipelines.schema.tables import Shard
@@ -530,6 +533,109 @@ class Custom(Format):
         require(len(result.center_m) == len(rows), "another number of boxes than in the table")
 
 
+def check_map(drive: Drive, folder: Path, name: str) -> None:
+    """Check a drive that was read from a map, its first scene, and that ElementTree reads the file without entities."""
+    check_drive(drive)
+    content = (folder / name).read_bytes()
+    require(b"<!ENTITY" not in content, "an entity was accepted")
+    try:
+        ElementTree.fromstring(content)
+    except (ElementTree.ParseError, ValueError, LookupError):
+        raise Silent("ElementTree refuses the XML") from None
+    if len(drive):
+        try:
+            scene = drive.scene(0)
+        except ValueError:  # Such a scene goes to the table rejects.
+            return
+        require(np.isfinite(scene.height_m).all() and np.isfinite(scene.center_m).all(), "a scene is not finite")
+
+
+class OpenStreetMap(Format):
+    """XML of OpenStreetMap: crossing streets, a house, a lamp, a tree, a signal, a hedge and a meadow."""
+
+    name = "osm"
+
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        places = {
+            **{1: (0, -9), 2: (0, 0), 3: (0, 9), 4: (-9, 0), 5: (9, 0)},
+            **{6: (1, 1), 7: (3, 1), 8: (3, 3), 9: (1, 3), 10: (2, -1), 11: (-1, 2), 12: (5, 1), 13: (7, 1)},
+        }
+        tags: dict[int, dict[str, str]] = {
+            2: {"highway": "traffic_signals"},
+            10: {"highway": "street_lamp", "height": "6"},
+            11: {"natural": "tree", "height": "9 m", "diameter_crown": "5"},
+        }
+        ways: list[tuple[list[int], dict[str, str]]] = [
+            ([1, 2, 3], {"highway": "residential", "width": "6", "sidewalk": "both", "parking:left": "lane"}),
+            ([4, 2, 5], {"highway": "primary", "lanes": "4", "oneway": "yes"}),
+            ([6, 7, 8, 9, 6], {"building": "yes", "building:levels": "3"}),
+            ([12, 13], {"barrier": "hedge", "height": "2"}),
+            ([4, 1, 5, 4], {"landuse": "meadow"}),
+        ]
+        root = ElementTree.Element("osm", version="0.6")
+        for number, (x, y) in places.items():
+            place = {"lat": f"{50 + y * 1e-4:.6f}", "lon": f"{10 + x * 1.5e-4:.6f}"}
+            node = ElementTree.SubElement(root, "node", {"id": str(number), "version": "1", **place})
+            self.add_tags(node, tags.get(number, {}))
+        for number, (nodes, of_way) in enumerate(ways):
+            way = ElementTree.SubElement(root, "way", id=str(100 + number), version="1")
+            for node in nodes:
+                ElementTree.SubElement(way, "nd", ref=str(node))
+            self.add_tags(way, of_way)
+        self.bases = [{"map.osm": ElementTree.tostring(root)}]
+
+    @staticmethod
+    def add_tags(element: ElementTree.Element, tags: dict[str, str]) -> None:
+        for key, value in tags.items():
+            ElementTree.SubElement(element, "tag", k=key, v=value)
+
+    def damage(self, base: Files, rng: random.Random) -> Files:
+        return self.change_one_file(base, rng, change_text)
+
+    def read(self, folder: Path) -> Any:
+        return osm.read_drive(str(folder / "map.osm"), osm.OsmOptions(furnish=True))
+
+    def check(self, folder: Path, result: Any, files: Files) -> None:
+        drive, report = result
+        check_map(drive, folder, "map.osm")
+        nodes = list(ElementTree.fromstring(files["map.osm"]).iter("node"))
+        require(report["objects"].get("tree", 0) <= len(nodes), "more trees than nodes")
+
+
+class OpenDrive(Format):
+    """XML of OpenDRIVE: the export of a scene of the town with lanes and junctions, and objects."""
+
+    name = "opendrive"
+
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        root = ElementTree.fromstring(export_opendrive(drive.scene(0)))
+        roads = root.findall("road")
+        for road in roads[4:]:
+            root.remove(road)
+        objects = ElementTree.SubElement(roads[0], "objects")
+        about = {"s": "2", "t": "6", "zOffset": "0", "hdg": "0.3", "height": "5"}
+        for number, kind in enumerate(("tree", "pole", "obstacle", "building")):
+            made = ElementTree.SubElement(objects, "object", {"id": str(number), "type": kind, "name": kind} | about)
+        outline = ElementTree.SubElement(made, "outline")
+        for u, v in ((-4, -3), (4, -3), (4, 3), (-4, 3)):
+            ElementTree.SubElement(outline, "cornerLocal", u=str(u), v=str(v), z="0", height="5")
+        signals = ElementTree.SubElement(roads[0], "signals")
+        ElementTree.SubElement(signals, "signal", {"id": "9", "dynamic": "yes"} | about | {"zOffset": "3"})
+        self.bases = [{"map.xodr": ElementTree.tostring(root)}]
+
+    def damage(self, base: Files, rng: random.Random) -> Files:
+        return self.change_one_file(base, rng, change_text)
+
+    def read(self, folder: Path) -> Any:
+        return opendrive.read_drive(str(folder / "map.xodr"), opendrive.OpenDriveOptions())
+
+    def check(self, folder: Path, result: Any, files: Files) -> None:
+        drive, report = result
+        check_map(drive, folder, "map.xodr")
+        roads = list(ElementTree.fromstring(files["map.xodr"]).iter("road"))
+        require(report["roads"] <= len(roads), "more roads than in the file")
+
+
 class Edits(Format):
     """Lists of edits, in JSON."""
 
@@ -611,5 +717,6 @@ class Models(Format):
 
 
 FORMATS: list[Callable[[Drive, Path], Format]] = [
-    Tables, OwnGlb, ForeignGlb, Voxels, Pictures, Kitti360, Argoverse2, Custom, Edits, Models,
+    Tables, OwnGlb, ForeignGlb, Voxels, Pictures, Kitti360, Argoverse2, Custom, OpenStreetMap, OpenDrive, Edits,
+    Models,
 ]  # fmt: skip

@@ -100,14 +100,14 @@ class Osm:
     spacing_m: float = 10.0
     """Distance between successive poses along a street."""
     free_pose_share: float = 0.25
-    """Share of the scenes that are crops at any place and heading, instead of views of a vehicle."""
+    """Share of the scenes that are crops at any heading near the streets, instead of views of a vehicle."""
     test_share: float = 0.1
-    """Largest share of the scenes that lie in test squares of 400 m."""
+    """Maximum share of the scenes that lie in test squares of 400 m; 0 makes no test split."""
     drive_on: Literal["right", "left"] = "right"
     """Side of the road on which vehicles drive."""
     furnish: bool = False
-    """Add parked cars, plants, lamps, signs, sidewalks and gardens that the extract lacks, with the rules of the town.
-    The labels of added objects begin with "furnished"."""
+    """Add parked vehicles, pedestrians, plants, lamps, signals, signs, sidewalks and front gardens that the extract
+    lacks, with the rules of the town. The labels of added objects begin with "furnished"."""
     seed: int = 0
     """Random seed of free poses and added objects."""
     slots: Literal["p95", "p99.5", "paper"] = "p99.5"
@@ -128,7 +128,7 @@ class OpenDrive:
     spacing_m: float = 10.0
     """Distance between successive poses along a lane."""
     test_share: float = 0.1
-    """Largest share of the scenes that lie in test squares of 400 m."""
+    """Maximum share of the scenes that lie in test squares of 400 m; 0 makes no test split."""
     slots: Literal["p95", "p99.5", "paper"] = "p99.5"
     """Rule for the number of slots per category: a percentile over the training split, or the paper's 514 slots in
     total. Models do not learn objects beyond these slots."""

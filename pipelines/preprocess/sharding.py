@@ -150,7 +150,7 @@ def plan_osm(inputs: tuple[str, ...], options: OsmOptions, test_share: float) ->
     Args:
         inputs: Extracts, or directories of extracts.
         options: Options of the reader.
-        test_share: Share of the area whose poses get the split test.
+        test_share: Maximum share of the poses that get the split test.
 
     Returns:
         The tasks.
@@ -181,7 +181,7 @@ def plan_opendrive(inputs: tuple[str, ...], options: OpenDriveOptions, test_shar
     Args:
         inputs: OpenDRIVE files, or directories of such files.
         options: Options of the reader.
-        test_share: Share of the scenes in test squares.
+        test_share: Maximum share of the poses that get the split test.
 
     Returns:
         The tasks.

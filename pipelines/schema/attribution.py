@@ -1,4 +1,4 @@
-"""Licence notices of data sources, which dataset.json and exported files state."""
+"""Licence notices of data sources, for dataset.json, the column `attribution` and exports."""
 
 from __future__ import annotations
 

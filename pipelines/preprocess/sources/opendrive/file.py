@@ -114,7 +114,7 @@ class Map:
 
 
 class SkippedError(ValueError):
-    """Raised for a road that cannot be read; the message is the reason."""
+    """Raised for an element that cannot be read. The message states the reason."""
 
 
 def list_maps(inputs: Iterable[str]) -> list[str]:
@@ -189,7 +189,7 @@ def read_map(path: str | PathLike) -> Map:
 
 def _parse_xml(source: InputPath) -> Element:
     if not source.is_file():  # Reading a named pipe would never end.
-        raise ValueError(f"{source} is missing or no regular file; {GET_FILE}")
+        raise ValueError(f"{source} is missing or is not a regular file; {GET_FILE}")
     local, limit = find_local_file(source), find_limit("json_bytes")
     try:
         with gzip.open(local) if source.name.endswith(".gz") else open(local, "rb") as stream:
@@ -226,7 +226,9 @@ def read_number(element: Element, name: str, default: float | None = None, large
     except ValueError:
         value = math.nan
     if not abs(value) <= largest:
-        raise SkippedError(f"{element.tag} with {name}={(text or '')[:20]!r}, expected a number")
+        raise SkippedError(
+            f"{element.tag} with {name}={(text or '')[:20]!r}, expected a finite number of at most {largest:g}"
+        )
     return value
 
 

@@ -14,7 +14,8 @@ from pipelines.preprocess.sources.osm.buildings import repair_polygons
 # From top to bottom; see LayeredGround.
 LAYERS = ("road", "parking", "building", "sidewalk", "ground", "terrain")
 STEP_M = 1.0  # Largest length of a piece of a lane.
-# Lane types of OpenDRIVE 1.4 to 1.8 with a ground class. Other types, such as none, have a class if their material has.
+# Lane types of OpenDRIVE 1.4 to 1.8 with a ground class. Lanes of other types, such as none, have the class of their
+# material, if it has one.
 LANE_CLASSES = {
     **dict.fromkeys(
         (
@@ -190,7 +191,7 @@ def make_lane_poses(roads: Map, spacing_m: float) -> LanePoses:
                     continue
                 chosen = min(lanes, key=abs)
                 strip = next(strip for strip in list_strips(road, section) if strip.lane.id == chosen)
-                # Stations are multiples of the spacing along the road, whatever the sections are.
+                # Poses lie at (k + 0.5) * spacing_m along the road, regardless of its sections.
                 first = np.ceil((section.s_m - spacing_m / 2) / spacing_m) * spacing_m + spacing_m / 2
                 s = np.arange(first, section.end_m, spacing_m)
                 width = np.interp(s, strip.s_m, np.abs(strip.outer_m - strip.inner_m))

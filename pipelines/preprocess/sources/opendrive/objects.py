@@ -22,7 +22,7 @@ LIGHT_M = (0.3, 0.3, 0.9)
 POLE_REACH_M = 1.0  # A signal farther than this from every pole gets a pole.
 LOW_SIGNAL_M = 0.5  # Signals below this height are marks on the road.
 
-# Categories by the attribute type, and by the attribute name where it is more exact (OpenDRIVE 1.4 to 1.8).
+# Category of each value of the attribute type (OpenDRIVE 1.4 to 1.8).
 TYPES = {
     "building": "construction_big",
     "tree": "vegetation_ellipsoid",
@@ -201,7 +201,9 @@ def _make_repeated(road: Road, element: Element, repeat: Element, category: str,
     distance = read_number(repeat, "distance", 0.0)
     continuous = distance <= 0
     count = int(np.ceil(length / PIECE_M)) if continuous else int(length // distance) + 1
-    if count > MAX_PIECES or length < 0:
+    if length < 0:
+        raise SkippedError("repeat with a negative length")
+    if count > MAX_PIECES:
         raise SkippedError(f"repeat with more than {MAX_PIECES} copies")
     if not count:
         return

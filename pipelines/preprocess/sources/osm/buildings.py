@@ -1,8 +1,8 @@
-"""Cover the footprint of a building with few oriented rectangles.
+"""Cover the footprint of a building with a few oriented rectangles.
 
 The rectangles are parallel to the main direction of the footprint's walls and do not overlap. Their sides lie on the
-coordinates of the corners of the footprint. The largest rectangle is chosen first, until the rectangles cover most of
-the footprint.
+coordinates of the corners of the footprint. Rectangles are chosen greedily by area until they cover the share COVERED
+of the footprint.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ import osmium.geom
 import pyproj
 import shapely
 
-from models.limits import require_within
+from models.limits import LimitError, require_within
 from pipelines.preprocess.sources.input_paths import InputPath, find_local_file, make_input_path
 
 SUFFIXES = (".osm", ".osm.gz", ".osm.bz2", ".osm.pbf", ".pbf")
@@ -37,7 +37,7 @@ KEYS = (
     "power",
     "traffic_sign",
 )
-# An area has one of these keys. Ways with other keys are lines, even if they are closed.
+# Keys of areas, in addition to highway. Each way is also a line, closed or not.
 AREA_KEYS = ("amenity", "area:highway", "building", "building:part", "landuse", "leisure", "natural")
 MAX_EXTENT_M = 100_000.0
 MAX_LATITUDE_DEG = 84.0
@@ -49,7 +49,7 @@ CUT_OUT = "cut out a part with --bbox WEST SOUTH EAST NORTH or --origin LATITUDE
 
 @dataclass(frozen=True)
 class Region:
-    """Part of an extract. At most one of both fields is set; without them, the region is the whole extract.
+    """Part of an extract. At most one of bbox_deg and origin_deg is set; without them, it is the whole extract.
 
     Attributes:
         bbox_deg: Longitude of the western border, latitude of the southern, longitude of the eastern, and latitude of
@@ -90,7 +90,7 @@ class Extract:
         box_m: Lower and upper corner (x, y) of the region (m).
         points: Nodes with tags.
         lines: Ways.
-        areas: Closed ways and multipolygons with a key of AREA_KEYS.
+        areas: Closed ways and multipolygons with a key of AREA_KEYS or the key highway.
         skipped: Number of features that were skipped for each reason.
     """
 
@@ -154,12 +154,12 @@ def read_extract(path: str | PathLike, region: Region | None = None, only_roads:
 
     Raises:
         ValueError: The file cannot be read, it has no highway in the region, or the region spans the antimeridian,
-            a pole or more than MAX_EXTENT_M.
+            latitudes beyond MAX_LATITUDE_DEG, or more than MAX_EXTENT_M.
     """
     region = region or Region()
     source = make_input_path(path)
     if not source.is_file():  # Reading a named pipe would never end.
-        raise ValueError(f"{source} is missing or no regular file; {GET_EXTRACT}")
+        raise ValueError(f"{source} is missing or is not a regular file; {GET_EXTRACT}")
     local = find_local_file(source)
     require_within("map_bytes", local.stat().st_size, f"{source}; {CUT_OUT}")
     skipped: Counter[str] = Counter()
@@ -170,7 +170,9 @@ def read_extract(path: str | PathLike, region: Region | None = None, only_roads:
             keys.append(kind)
             geometries.append(geometry)
             records.append(record)
-    except RuntimeError as error:  # osmium's error for files that it cannot parse.
+    except LimitError:
+        raise
+    except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:  # Files that osmium cannot parse.
         remedy = "sort the file with 'osmium sort'" if "out of order" in str(error) else GET_EXTRACT
         raise ValueError(f"{source}: {str(error)[:200]}; {remedy}") from error
     geometries = np.array(geometries, object)
@@ -283,6 +285,8 @@ def _restore(geometries: np.ndarray, projection: str) -> np.ndarray:
 def _find_box_m(source: InputPath, region: Region, box_deg: np.ndarray, project: Any) -> np.ndarray:
     """Return the lower and the upper corner of the region in metres."""
     if region.origin_deg is not None:
+        if 2 * region.radius_m > MAX_EXTENT_M:
+            raise ValueError(f"--radius-m is {region.radius_m:g}, expected at most {MAX_EXTENT_M / 2:g}")
         return np.array([[-1.0, -1.0], [1.0, 1.0]]) * region.radius_m
     west, south, east, north = box_deg
     corners = project(np.array([[west, south], [east, south], [east, north], [west, north]]))

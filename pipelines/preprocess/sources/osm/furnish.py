@@ -1,8 +1,8 @@
-"""Add what an extract of OpenStreetMap lacks to its streets, with the rules of the town: parked cars, plants, lamps,
-signs, sidewalks and front gardens.
+"""Add what an extract of OpenStreetMap lacks to its streets, with the rules of the town: parked vehicles, pedestrians,
+plants, lamps, signals, signs, sidewalks and front gardens. Car parks get cars.
 
 The label of each added object begins with FURNISHED. Where the extract has plants, lamps or signs, no others are added.
-Roads without buildings near them stay as they are.
+Roads without buildings near them are unchanged.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ KNOWN_M = 25.0  # Within this distance of objects that the extract contains, no 
 BAY_M, LOT_ROW_M, LOT_AISLE_M = 2.6, 5.2, 6.0  # Width and length of a bay of a car park, and width of its aisles.
 LOT_TAKEN = 0.5  # Share of occupied bays.
 MAX_LOT_M2 = 20_000.0
-LARGEST_IOU3D = 0.1  # Of an added object and another of its category.
+LARGEST_IOU3D = 0.1  # Maximum IoU3D between two added objects of a category.
 OVERLAP_SQUARE_M = 64.0
 FLAT = Land(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), 0.0, np.zeros(3))
 
@@ -159,7 +159,7 @@ def _find_sidewalk(piece: Piece, site: Site, walked: shapely.STRtree, more_groun
     if not width and not profile.knows_sidewalk[side]:
         probe = piece.frame.uv(np.full(3, piece.length_m / 2), profile.parking_m[side] + np.array([0.8, 1.8, 2.8]))
         if len(walked.query(shapely.points(probe), predicate="intersects")[0]):
-            width = 2.0  # The sidewalk is a way of its own in the extract.
+            width = 2.0  # The sidewalk is a separate way in the extract.
         elif site.rng.random() < site.district.sidewalks:
             width = float(np.mean(site.district.sidewalk_m))
             more_ground.append(("sidewalk", _make_side(piece, kerb + width)))
@@ -182,9 +182,9 @@ def _furnish_piece(site: Site, piece: Piece, depth: float, has_sidewalk: bool) -
     parking = profile.parking_m[side]
     place = Side(depth, has_sidewalk, False, (profile.left_m + profile.right_m) / 2)
     index = 0 if side else 2  # Rules of the town differ between the two sides of a street.
-    if parking:
+    if parking and not _is_forbidden(piece):
         _fill_parking(site, piece, parking)
-    elif _allows_parking(piece):
+    elif not parking and _allows_parking(piece):
         park_cars(site, piece.frame, 2.0, piece.length_m - 2.0, index, place)
     frame = piece.frame.at(0.0, parking)
     add_furniture(site, frame, 0.0, piece.length_m, index, place, bool(rng.random() < 0.5))
@@ -196,6 +196,13 @@ def _allows_parking(piece: Piece) -> bool:
     side = ("left", "right")[piece.side]
     tags = piece.road.tags
     return not any(key.startswith((f"parking:{side}", "parking:both", "parking:lane")) for key in tags)
+
+
+def _is_forbidden(piece: Piece) -> bool:
+    """Return whether tags forbid to park or stop on the parking spaces of a side."""
+    side = ("left", "right")[piece.side]
+    texts = [piece.road.tags.get(f"parking:{name}:restriction", "") for name in (side, "both")]
+    return any(text in ("no_parking", "no_stopping", "no_standing") for text in texts)
 
 
 def _fill_parking(site: Site, piece: Piece, depth: float) -> None:
@@ -236,7 +243,10 @@ def _fill_lots(sheet: StreetSheet, rng: np.random.Generator, polygon: Any) -> No
 def _find_fitting(
     added: dict[str, np.ndarray], known: dict[str, np.ndarray], footprints: list[Any], ground: list[Layered]
 ) -> np.ndarray:
-    """Return a mask of added objects that stand outside of buildings, carriageways, and objects of the extract."""
+    """Return a mask of added objects outside of buildings, and, except cars, outside of carriageways.
+
+    Objects near mapped objects of their kind are left out, and so are those that overlap other added objects.
+    """
     category, xy = added["category"], added["center_m"][:, :2]
     points = shapely.points(xy)
     kept = np.ones(len(xy), bool)
@@ -259,7 +269,7 @@ def _find_fitting(
 def _find_overlapping(added: dict[str, np.ndarray], index: np.ndarray) -> np.ndarray:
     """Return those of the objects `index` that overlap earlier ones of their category, except vegetation.
 
-    Objects are compared within squares, because comparing all of them at once would need too much memory.
+    Objects are compared within squares, because comparing all pairs would need too much memory.
     """
     index = index[~np.isin(added["category"][index], VEGETATION)]
     square = np.floor(added["center_m"][index, :2] / OVERLAP_SQUARE_M).astype(np.int64)

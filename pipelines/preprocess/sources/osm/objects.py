@@ -1,7 +1,8 @@
 """Objects of an extract as boxes and ellipsoids: trees, hedges, walls, lamps, signals, signs, bollards, furniture.
 
-OpenStreetMap states the place of an object and seldom its size. Sizes without tags come from the distributions of the
-town (sources/town/assets.py), with a random generator that depends on the number of the node or way.
+OpenStreetMap states the place of an object and seldom its size. Missing sizes of plants, lamps, signals and signs are
+drawn from the distributions of the town (sources/town/assets.py), with a random generator that depends on the number of
+the node or way. Other objects have the default sizes below; size tags of street furniture are not read.
 """
 
 from __future__ import annotations
@@ -251,7 +252,8 @@ def _find_posts(
 ) -> list[tuple[list[float], float]]:
     """Return places and angles of the poles of a signal or a sign.
 
-    Signals and signs on the line of a road stand at its right kerb, for each direction of travel that they control.
+    On the line of a road, the result has one pole per controlled direction of travel, at the right kerb in this
+    direction, also with left-hand traffic.
     """
     if road is None:
         return [(place.tolist(), _face_road(place, nearest) + np.pi / 2)]

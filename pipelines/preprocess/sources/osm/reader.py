@@ -3,7 +3,7 @@
     drive, report = read_drive("city.osm.pbf", OsmOptions(region=Region(origin_deg=(52.48, 13.43))))
 
 The ground is flat, because OpenStreetMap has no heights of the ground. The world frame is the local metric frame of the
-extract (extract.py). Things that the extract does not contain are missing, unless they are furnished (furnish.py).
+extract (extract.py). Objects that the extract does not contain are missing, unless furnish.py adds them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class OsmOptions:
         spacing_m: Distance between successive poses of a street (m).
         free_pose_share: Share of poses at any place and heading.
         drive_on_left: Whether vehicles drive on the left.
-        furnish: Whether to add parked cars, plants, lamps and signs that the extract lacks.
+        furnish: Whether to add objects and ground that the extract lacks (furnish.py).
         seed: Seed of free poses and of furnished objects.
     """
 

@@ -37,7 +37,7 @@ class Road:
 
 
 class Place(NamedTuple):
-    """Poses.
+    """Poses along the streets of an extract.
 
     Attributes:
         xy_m: Positions (m).
@@ -81,10 +81,11 @@ def sample_line(line: Any, distance_m: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def make_places(extract: Extract, spacing_m: float, free_share: float, drive_on_left: bool, seed: int) -> Place:
-    """Return poses along the streets, in both directions where traffic runs in both.
+    """Return poses along the streets, in each direction of travel.
 
-    The poses of a vehicle lie in the middle of the carriageway's half on its side. Free poses lie near them. All poses
-    are ordered by squares, so that consecutive poses see the same part of the extract.
+    The poses of a vehicle lie in the middle of the carriageway's half on its side. The crops of free poses lie within
+    FREE_OFFSET_M of them along each axis. All poses are ordered by squares, so that consecutive poses see the same part
+    of the extract.
 
     Args:
         extract: Extract.
@@ -94,7 +95,7 @@ def make_places(extract: Extract, spacing_m: float, free_share: float, drive_on_
         seed: Seed of the free poses.
 
     Returns:
-        Poses inside the region of the extract.
+        Poses of vehicles inside the region of the extract, and free poses near them.
     """
     parts, rotations = [], []
     for road in list_roads(extract):
@@ -133,7 +134,7 @@ def _draw_free_poses(xy: np.ndarray, share: float, seed: int) -> tuple[np.ndarra
 
 
 def order_by_squares(xy_m: np.ndarray) -> np.ndarray:
-    """Return an order (p,) in which points of a square follow each other, and squares run to and fro along the rows."""
+    """Return an order (p,) that groups points by square; the squares follow a serpentine order."""
     square = np.floor(xy_m / SQUARE_M).astype(np.int64)
     column = np.where(square[:, 1] % 2 == 0, square[:, 0], -square[:, 0])
     return np.lexsort([np.arange(len(xy_m)), column, square[:, 1]])

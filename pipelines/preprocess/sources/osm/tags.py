@@ -29,7 +29,7 @@ LANE_M = {
     "service": 2.25,
 }
 STREETS = tuple(name for name in LANE_M if name not in ("service", "busway", "motorway"))  # Poses lie on them.
-FAST_ROADS = ("motorway", "trunk")  # Each direction has two lanes and a way of its own.
+FAST_ROADS = ("motorway", "trunk")  # Each direction has two lanes and a separate way.
 MIN_ROAD_M, MAX_ROAD_M = 2.0, 40.0
 ONE_LANE_M = 3.5  # Least width of a road with one lane.
 # Ways of people who walk or cycle, their ground class, and their width (m).
