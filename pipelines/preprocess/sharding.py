@@ -9,12 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.preprocess.sources import argoverse2, custom, kitti360
+from pipelines.preprocess.sources.opendrive import reader as opendrive
 from pipelines.preprocess.sources.opendrive.file import list_maps
-from pipelines.preprocess.sources.opendrive.reader import SOURCE as OPENDRIVE
-from pipelines.preprocess.sources.opendrive.reader import OpenDriveOptions, read_poses
+from pipelines.preprocess.sources.osm import reader as osm
 from pipelines.preprocess.sources.osm.extract import list_extracts
-from pipelines.preprocess.sources.osm.reader import SOURCE as OSM
-from pipelines.preprocess.sources.osm.reader import OsmOptions, read_places
 from pipelines.preprocess.sources.town import generator
 from pipelines.schema.splits import ARGOVERSE2_SPLIT, TEST, TRAIN, UNUSED, make_no_split, split_poses, split_squares
 from pipelines.schema.tables import Shard
@@ -144,7 +142,7 @@ def plan_custom(root: str, split: bool = True, skip_unreadable: bool = False) ->
     return _plan_drives("own", keys, {name: frame for name, (frame, _) in poses.items()}, labels)
 
 
-def plan_osm(inputs: tuple[str, ...], options: OsmOptions, test_share: float) -> list[ShardTask]:
+def plan_osm(inputs: tuple[str, ...], options: osm.OsmOptions, test_share: float) -> list[ShardTask]:
     """Plan tasks of at most SHARD_SCENES poses of one extract of OpenStreetMap and one split.
 
     Args:
@@ -160,11 +158,11 @@ def plan_osm(inputs: tuple[str, ...], options: OsmOptions, test_share: float) ->
     """
     keys, frames, labels = {}, {}, {}
     for path in list_extracts(inputs):
-        name, places = read_places(path, options)
-        keys[name], frames[name] = (path, options), np.arange(len(places.xy_m))
-        labels[name] = split_squares(places.xy_m, places.yaw_rad, test_share)
+        name, poses = osm.read_poses(path, options)
+        keys[name], frames[name] = (path, options), np.arange(len(poses.xy_m))
+        labels[name] = split_squares(poses.xy_m, poses.yaw_rad, test_share)
     _require_training_scenes(labels, test_share)
-    return _plan_drives(OSM, keys, frames, labels)
+    return _plan_drives(osm.SOURCE, keys, frames, labels)
 
 
 def _require_training_scenes(labels: dict[str, np.ndarray], test_share: float) -> None:
@@ -175,7 +173,7 @@ def _require_training_scenes(labels: dict[str, np.ndarray], test_share: float) -
         )
 
 
-def plan_opendrive(inputs: tuple[str, ...], options: OpenDriveOptions, test_share: float) -> list[ShardTask]:
+def plan_opendrive(inputs: tuple[str, ...], options: opendrive.OpenDriveOptions, test_share: float) -> list[ShardTask]:
     """Plan tasks of at most SHARD_SCENES poses of one OpenDRIVE file and one split.
 
     Args:
@@ -191,11 +189,11 @@ def plan_opendrive(inputs: tuple[str, ...], options: OpenDriveOptions, test_shar
     """
     keys, frames, labels = {}, {}, {}
     for path in list_maps(inputs):
-        name, poses = read_poses(path, options)
+        name, poses = opendrive.read_poses(path, options)
         keys[name], frames[name] = (path, options), np.arange(len(poses.yaw_rad))
         labels[name] = split_squares(poses.xyz_m[:, :2], poses.yaw_rad, test_share)
     _require_training_scenes(labels, test_share)
-    return _plan_drives(OPENDRIVE, keys, frames, labels)
+    return _plan_drives(opendrive.SOURCE, keys, frames, labels)
 
 
 def plan_argoverse2(root: str) -> list[ShardTask]:

@@ -26,7 +26,7 @@ from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.osm.buildings import cover_footprint, find_direction, repair_polygons
 from pipelines.preprocess.sources.osm.extract import Region, list_extracts, read_extract
 from pipelines.preprocess.sources.osm.furnish import FURNISHED
-from pipelines.preprocess.sources.osm.reader import OsmOptions, read_drive, read_places
+from pipelines.preprocess.sources.osm.reader import OsmOptions, read_drive, read_poses
 from pipelines.preprocess.sources.osm.tags import find_heights, find_profile, parse_length
 from pipelines.schema.attribution import ATTRIBUTIONS, find_attribution
 from pipelines.schema.conversion import make_scene_tables, parse_scenes
@@ -339,7 +339,7 @@ def test_region_keeps_poses_inside_and_content_around(tmp_path):
     small = OsmOptions(Region(origin_deg=(LATITUDE, LONGITUDE), radius_m=50.0), free_pose_share=0.0)
     drive, _ = read_drive(path, small)
     assert np.abs(drive.world_from_imu[:, :2, 3]).max() <= 50.0 and len(drive.category) == 1
-    assert read_places(path, small)[1].xy_m.shape == (len(drive), 2)
+    assert read_poses(path, small)[1].xy_m.shape == (len(drive), 2)
 
 
 def test_squares_split_crops_without_overlap():
@@ -464,4 +464,4 @@ def test_street_without_poses_is_refused(tmp_path):
     made.way([(-50.0, 0.0), (50.0, 0.0)], highway="footway")
     path = made.write(tmp_path / "map.osm")
     with pytest.raises(ValueError, match="no street lies in the region"):
-        read_places(path, OsmOptions(HERE))
+        read_poses(path, OsmOptions(HERE))

@@ -80,7 +80,7 @@ class Box(NamedTuple):
     size_m: tuple[float, float, float]
 
 
-class Found(NamedTuple):
+class MapObjects(NamedTuple):
     """Objects of a map.
 
     Attributes:
@@ -96,7 +96,7 @@ class Found(NamedTuple):
     iou: list[float]
 
 
-def make_objects(roads: Map, skipped: Counter[str]) -> Found:
+def make_objects(roads: Map, skipped: Counter[str]) -> MapObjects:
     """Return the objects and signals of all roads.
 
     Args:
@@ -106,7 +106,7 @@ def make_objects(roads: Map, skipped: Counter[str]) -> Found:
     Returns:
         Boxes, footprints and parking spaces.
     """
-    found = Found([], [], [], [])
+    found = MapObjects([], [], [], [])
     for road in roads.roads:
         for element in road.objects:
             try:
@@ -126,7 +126,7 @@ def make_objects(roads: Map, skipped: Counter[str]) -> Found:
 # ----------------------------------------------------------------------------------------------------- objects
 
 
-def _add_object(road: Road, element: Element, found: Found, skipped: Counter[str]) -> None:
+def _add_object(road: Road, element: Element, found: MapObjects, skipped: Counter[str]) -> None:
     kind, name = element.get("type", "none"), element.get("name", "")
     outline = _read_outline(road, element)
     if kind == "parkingSpace":
@@ -267,7 +267,7 @@ def _read_outline(road: Road, element: Element) -> np.ndarray | None:
     return points
 
 
-def _add_building(element: Element, label: str, outline: np.ndarray, found: Found) -> None:
+def _add_building(element: Element, label: str, outline: np.ndarray, found: MapObjects) -> None:
     polygons, _ = repair_polygons([shapely.Polygon(outline[:, :2])])
     footprint = polygons[0] if polygons[0].area >= 1.0 else shapely.MultiPoint(outline[:, :2]).convex_hull
     if footprint.geom_type not in ("Polygon", "MultiPolygon") or footprint.area < 1.0:

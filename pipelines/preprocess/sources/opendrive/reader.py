@@ -17,7 +17,7 @@ from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES, Grid, Scene, make
 from pipelines.preprocess.sources.drive import HIDDEN, STATIC, Drive, LayeredGround
 from pipelines.preprocess.sources.opendrive.file import read_map
 from pipelines.preprocess.sources.opendrive.lanes import LAYERS, LanePoses, make_lane_poses, triangulate_lanes
-from pipelines.preprocess.sources.opendrive.objects import Box, Found, make_objects
+from pipelines.preprocess.sources.opendrive.objects import Box, MapObjects, make_objects
 from pipelines.preprocess.sources.osm.roads import order_by_squares
 from pipelines.preprocess.sources.town.world import IMU_HEIGHT_M
 
@@ -108,7 +108,7 @@ def read_drive(path: str, options: OpenDriveOptions) -> tuple[Drive, dict]:
     }
 
 
-def make_ground(lanes: tuple[np.ndarray, np.ndarray], found: Found) -> LayeredGround:
+def make_ground(lanes: tuple[np.ndarray, np.ndarray], found: MapObjects) -> LayeredGround:
     """Join the surfaces of lanes, parking spaces and buildings.
 
     Args:

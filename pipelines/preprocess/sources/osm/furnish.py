@@ -19,7 +19,7 @@ from models.geometry.iou3d import make_boxes
 from models.geometry.suppression import find_suppressed
 from models.scene import CATEGORY_INDEX, VEGETATION, VEHICLES
 from pipelines.preprocess.sources.osm.buildings import find_direction
-from pipelines.preprocess.sources.osm.ground import Layered
+from pipelines.preprocess.sources.osm.ground import LayerPolygon
 from pipelines.preprocess.sources.osm.roads import Road
 from pipelines.preprocess.sources.osm.tags import PARKING_M, STREETS
 from pipelines.preprocess.sources.town.land import Land, LocalFrame
@@ -64,10 +64,10 @@ def furnish_streets(
     roads: list[Road],
     footprints: list[Any],
     boxes: dict[str, np.ndarray],
-    ground: list[Layered],
+    ground: list[LayerPolygon],
     seed: int,
     drive_on_left: bool,
-) -> tuple[dict[str, np.ndarray], list[Layered]]:
+) -> tuple[dict[str, np.ndarray], list[LayerPolygon]]:
     """Add objects and ground along the streets.
 
     Args:
@@ -151,7 +151,9 @@ def _list_pieces(roads: list[Road], drive_on_left: bool) -> Iterator[Piece]:
                 yield Piece(road, side, frame, length)
 
 
-def _find_sidewalk(piece: Piece, site: Site, walked: shapely.STRtree, more_ground: list[Layered]) -> tuple[float, bool]:
+def _find_sidewalk(
+    piece: Piece, site: Site, walked: shapely.STRtree, more_ground: list[LayerPolygon]
+) -> tuple[float, bool]:
     """Return the depth of the sidewalk or the verge, and whether there is a sidewalk. Unknown sidewalks are added."""
     profile, side = piece.road.profile, piece.side
     kerb = (profile.left_m, profile.right_m)[side] + profile.parking_m[side]
@@ -241,7 +243,7 @@ def _fill_lots(sheet: StreetSheet, rng: np.random.Generator, polygon: Any) -> No
 
 
 def _find_fitting(
-    added: dict[str, np.ndarray], known: dict[str, np.ndarray], footprints: list[Any], ground: list[Layered]
+    added: dict[str, np.ndarray], known: dict[str, np.ndarray], footprints: list[Any], ground: list[LayerPolygon]
 ) -> np.ndarray:
     """Return a mask of added objects outside of buildings, and, except cars, outside of carriageways.
 

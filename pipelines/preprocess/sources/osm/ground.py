@@ -21,7 +21,7 @@ ROUND = 4  # Segments per quarter circle of rounded ends and corners.
 MAX_POINTS = 500  # Polygons with more points are cut into tiles, because triangulating them takes too long.
 TILE_M = 128.0
 
-Layered = tuple[str, Any]  # Name of a layer, and a polygon or multipolygon (m).
+LayerPolygon = tuple[str, Any]  # Name of a layer, and a polygon or multipolygon (m).
 
 
 def make_strip(line: Any, from_m: float, to_m: float, is_round: bool = False) -> Any:
@@ -43,7 +43,7 @@ def make_strip(line: Any, from_m: float, to_m: float, is_round: bool = False) ->
     return shapely.buffer(line, half, quad_segs=ROUND, cap_style="round" if is_round else "flat")
 
 
-def list_ground(extract: Extract, roads: Iterable[Road]) -> list[Layered]:
+def list_ground(extract: Extract, roads: Iterable[Road]) -> list[LayerPolygon]:
     """Return the polygons of roads, paths and areas, but not those of buildings.
 
     Args:
@@ -53,7 +53,7 @@ def list_ground(extract: Extract, roads: Iterable[Road]) -> list[Layered]:
     Returns:
         Layer and polygon of each.
     """
-    found: list[Layered] = []
+    found: list[LayerPolygon] = []
     for road in roads:
         profile, line = road.profile, road.line
         found.append((profile.ground, make_strip(line, -profile.right_m, profile.left_m, is_round=True)))
@@ -79,7 +79,7 @@ def list_ground(extract: Extract, roads: Iterable[Road]) -> list[Layered]:
     return found
 
 
-def make_ground(polygons: list[Layered]) -> LayeredGround:
+def make_ground(polygons: list[LayerPolygon]) -> LayeredGround:
     """Triangulate polygons at height 0.
 
     Args:

@@ -20,9 +20,9 @@ from pipelines.preprocess.sources.drive import STATIC, Drive
 from pipelines.preprocess.sources.osm.buildings import cover_footprint, repair_polygons
 from pipelines.preprocess.sources.osm.extract import Extract, Feature, Region, read_extract
 from pipelines.preprocess.sources.osm.furnish import furnish_streets
-from pipelines.preprocess.sources.osm.ground import Layered, list_ground, make_ground
+from pipelines.preprocess.sources.osm.ground import LayerPolygon, list_ground, make_ground
 from pipelines.preprocess.sources.osm.objects import Box, make_objects
-from pipelines.preprocess.sources.osm.roads import Place, list_roads, make_places, make_world_from_imu
+from pipelines.preprocess.sources.osm.roads import StreetPoses, list_roads, make_street_poses, make_world_from_imu
 from pipelines.preprocess.sources.osm.tags import GARAGES, find_heights, is_underground
 
 SOURCE = "osm"
@@ -50,7 +50,7 @@ class OsmOptions:
     seed: int = 0
 
 
-def read_places(path: str, options: OsmOptions) -> tuple[str, Place]:
+def read_poses(path: str, options: OsmOptions) -> tuple[str, StreetPoses]:
     """Read the poses along the streets of an extract.
 
     Args:
@@ -64,16 +64,16 @@ def read_places(path: str, options: OsmOptions) -> tuple[str, Place]:
         ValueError: The file cannot be read, or no street lies in the region.
     """
     extract = read_extract(path, options.region, only_roads=True)
-    places = _make_places(extract, options)
-    if not len(places.xy_m):
+    poses = _make_street_poses(extract, options)
+    if not len(poses.xy_m):
         raise ValueError(
             f"{path}: no street lies in the region; scenes need a way with highway=residential, primary or similar"
         )
-    return extract.name, places
+    return extract.name, poses
 
 
-def _make_places(extract: Extract, options: OsmOptions) -> Place:
-    return make_places(extract, options.spacing_m, options.free_pose_share, options.drive_on_left, options.seed)
+def _make_street_poses(extract: Extract, options: OsmOptions) -> StreetPoses:
+    return make_street_poses(extract, options.spacing_m, options.free_pose_share, options.drive_on_left, options.seed)
 
 
 def read_drive(path: str, options: OsmOptions) -> tuple[Drive, dict]:
@@ -93,22 +93,22 @@ def read_drive(path: str, options: OsmOptions) -> tuple[Drive, dict]:
     roads = list_roads(extract)
     buildings, footprints, report = _make_buildings(extract)
     objects = make_objects(extract, roads)
-    ground: list[Layered] = list_ground(extract, roads) + [("building", footprint) for footprint in footprints]
+    ground: list[LayerPolygon] = list_ground(extract, roads) + [("building", footprint) for footprint in footprints]
     boxes = _make_boxes(buildings + objects)
     if options.furnish:
         added, more_ground = furnish_streets(roads, footprints, boxes, ground, options.seed, options.drive_on_left)
         boxes = {name: np.concatenate([boxes[name], added[name]]) for name in boxes}
         ground += more_ground
-    places = _make_places(extract, options)
+    poses = _make_street_poses(extract, options)
     drive = Drive(
         source=SOURCE,
         sequence=extract.name,
         **boxes,
         ground_classes=KITTI_GROUND_CLASSES,
         ground=make_ground(ground),
-        frame=np.arange(len(places.xy_m)),
-        world_from_imu=make_world_from_imu(places),
-        free_pose=places.is_free,
+        frame=np.arange(len(poses.xy_m)),
+        world_from_imu=make_world_from_imu(poses),
+        free_pose=poses.is_free,
     )
     named = Counter(box.label for box in objects)
     return drive, report | {

@@ -36,7 +36,7 @@ class Road:
     nodes: tuple[int, ...]
 
 
-class Place(NamedTuple):
+class StreetPoses(NamedTuple):
     """Poses along the streets of an extract.
 
     Attributes:
@@ -80,7 +80,9 @@ def sample_line(line: Any, distance_m: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return points[segment] + direction * (distance_m - start[segment])[:, None], direction
 
 
-def make_places(extract: Extract, spacing_m: float, free_share: float, drive_on_left: bool, seed: int) -> Place:
+def make_street_poses(
+    extract: Extract, spacing_m: float, free_share: float, drive_on_left: bool, seed: int
+) -> StreetPoses:
     """Return poses along the streets, in each direction of travel.
 
     The poses of a vehicle lie in the middle of the carriageway's half on its side. The crops of free poses lie within
@@ -121,7 +123,7 @@ def make_places(extract: Extract, spacing_m: float, free_share: float, drive_on_
     is_free = np.arange(len(xy) + len(free_xy)) >= len(xy)
     xy, yaw = np.concatenate([xy, free_xy]), np.concatenate([yaw, free_yaw])
     order = order_by_squares(xy)
-    return Place(xy[order], yaw[order], is_free[order])
+    return StreetPoses(xy[order], yaw[order], is_free[order])
 
 
 def _draw_free_poses(xy: np.ndarray, share: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -140,12 +142,12 @@ def order_by_squares(xy_m: np.ndarray) -> np.ndarray:
     return np.lexsort([np.arange(len(xy_m)), column, square[:, 1]])
 
 
-def make_world_from_imu(places: Place) -> np.ndarray:
+def make_world_from_imu(poses: StreetPoses) -> np.ndarray:
     """Return pose matrices (p, 3, 4) with the axes x forward, y right and z down, IMU_HEIGHT_M above the ground."""
-    cos, sin = np.cos(places.yaw_rad), np.sin(places.yaw_rad)
+    cos, sin = np.cos(poses.yaw_rad), np.sin(poses.yaw_rad)
     zero, one = np.zeros_like(cos), np.ones_like(cos)
     forward, right = np.stack([cos, sin, zero], axis=1), np.stack([sin, -cos, zero], axis=1)
-    position = np.column_stack([places.xy_m, np.full(len(cos), IMU_HEIGHT_M)])
+    position = np.column_stack([poses.xy_m, np.full(len(cos), IMU_HEIGHT_M)])
     return np.stack([forward, right, np.stack([zero, zero, -one], axis=1), position], axis=2)
 
 
