@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.preprocess.sources import argoverse2, custom, kitti360
+from pipelines.preprocess.sources.maps import list_map_files
+from pipelines.preprocess.sources.opendrive import file
 from pipelines.preprocess.sources.opendrive import reader as opendrive
-from pipelines.preprocess.sources.opendrive.file import list_maps
+from pipelines.preprocess.sources.osm import extract
 from pipelines.preprocess.sources.osm import reader as osm
-from pipelines.preprocess.sources.osm.extract import list_extracts
 from pipelines.preprocess.sources.town import generator
 from pipelines.schema.splits import ARGOVERSE2_SPLIT, TEST, TRAIN, UNUSED, make_no_split, split_poses, split_squares
 from pipelines.schema.tables import Shard
@@ -157,7 +158,7 @@ def plan_osm(inputs: tuple[str, ...], options: osm.OsmOptions, test_share: float
         ValueError: A file cannot be read, no street lies in the region, or no training scene remains.
     """
     keys, frames, labels = {}, {}, {}
-    for path in list_extracts(inputs):
+    for path in list_map_files(inputs, extract.SUFFIXES, extract.GET_EXTRACT):
         name, poses = osm.read_poses(path, options)
         keys[name], frames[name] = (path, options), np.arange(len(poses.xy_m))
         labels[name] = split_squares(poses.xy_m, poses.yaw_rad, test_share)
@@ -188,7 +189,7 @@ def plan_opendrive(inputs: tuple[str, ...], options: opendrive.OpenDriveOptions,
         ValueError: A file cannot be read, it has no driving lane, or no training scene remains.
     """
     keys, frames, labels = {}, {}, {}
-    for path in list_maps(inputs):
+    for path in list_map_files(inputs, file.SUFFIXES, file.GET_FILE):
         name, poses = opendrive.read_poses(path, options)
         keys[name], frames[name] = (path, options), np.arange(len(poses.yaw_rad))
         labels[name] = split_squares(poses.xyz_m[:, :2], poses.yaw_rad, test_share)

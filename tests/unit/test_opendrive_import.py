@@ -16,7 +16,8 @@ from models.scene import CATEGORIES, CATEGORY_INDEX, KITTI_GROUND_CLASSES, Grid,
 from pipelines.io.opendrive import export_opendrive
 from pipelines.preprocess.sharding import plan_opendrive
 from pipelines.preprocess.sources.drive import Drive, Pose
-from pipelines.preprocess.sources.opendrive.file import Map, Road, list_maps, read_map
+from pipelines.preprocess.sources.maps import list_map_files
+from pipelines.preprocess.sources.opendrive.file import GET_FILE, SUFFIXES, Map, Road, read_map
 from pipelines.preprocess.sources.opendrive.lanes import list_strips
 from pipelines.preprocess.sources.opendrive.reader import OpenDriveOptions, read_drive, read_poses
 from pipelines.preprocess.sources.opendrive.reference_line import NO_CUBICS, Cubics, Geometry, ReferenceLine
@@ -364,9 +365,9 @@ def test_notice_of_our_export_is_kept(tmp_path):
 def test_plan_lists_files_and_poses(tmp_path):
     write(tmp_path, make_road(), name="a.xodr")
     write(tmp_path, make_road(), name="b.xodr")
-    assert [Path(path).name for path in list_maps((str(tmp_path),))] == ["a.xodr", "b.xodr"]
+    assert [Path(path).name for path in list_map_files((str(tmp_path),), SUFFIXES, GET_FILE)] == ["a.xodr", "b.xodr"]
     tasks = plan_opendrive((str(tmp_path),), OpenDriveOptions(), 0.0)
     assert [(task.split, task.parts[0].sequence, len(task.parts[0].poses)) for task in tasks] == [
         ("train", "a", 16), ("train", "b", 16)]  # fmt: skip
     with pytest.raises(ValueError, match="no such file or directory"):
-        list_maps((str(tmp_path / "c.xodr"),))
+        list_map_files((str(tmp_path / "c.xodr"),), SUFFIXES, GET_FILE)

@@ -23,8 +23,9 @@ from pipelines.io.mesh_import import import_glb
 from pipelines.io.opendrive import export_opendrive
 from pipelines.preprocess.sharding import plan_osm
 from pipelines.preprocess.sources.drive import Drive
+from pipelines.preprocess.sources.maps import list_map_files
 from pipelines.preprocess.sources.osm.buildings import cover_footprint, find_direction, repair_polygons
-from pipelines.preprocess.sources.osm.extract import Region, list_extracts, read_extract
+from pipelines.preprocess.sources.osm.extract import GET_EXTRACT, SUFFIXES, Region, read_extract
 from pipelines.preprocess.sources.osm.furnish import FURNISHED
 from pipelines.preprocess.sources.osm.reader import OsmOptions, read_drive, read_poses
 from pipelines.preprocess.sources.osm.tags import find_heights, find_profile, parse_length
@@ -441,14 +442,14 @@ def test_inputs_are_files_or_directories(tmp_path):
     made = make_street()
     for name in ("a.osm", "b.osm"):
         made.write(tmp_path / name)
-    assert [Path(p).name for p in list_extracts((str(tmp_path),))] == ["a.osm", "b.osm"]
+    assert [Path(p).name for p in list_map_files((str(tmp_path),), SUFFIXES, GET_EXTRACT)] == ["a.osm", "b.osm"]
     with pytest.raises(ValueError, match="no such file"):
-        list_extracts((str(tmp_path / "c.osm"),))
+        list_map_files((str(tmp_path / "c.osm"),), SUFFIXES, GET_EXTRACT)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="contains no extract"):
-        list_extracts((str(tmp_path / "empty"),))
+    with pytest.raises(ValueError, match="contains no file"):
+        list_map_files((str(tmp_path / "empty"),), SUFFIXES, GET_EXTRACT)
     with pytest.raises(ValueError, match="would both be named a"):
-        list_extracts((str(tmp_path / "a.osm"), str(tmp_path / "a.osm")))
+        list_map_files((str(tmp_path / "a.osm"), str(tmp_path / "a.osm")), SUFFIXES, GET_EXTRACT)
 
 
 def test_test_squares_must_leave_training_scenes(tmp_path):

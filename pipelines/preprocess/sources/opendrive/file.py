@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import math
-import re
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ import numpy as np
 
 from models.limits import find_limit, require_within
 from pipelines.preprocess.sources.input_paths import InputPath, find_local_file, make_input_path
+from pipelines.preprocess.sources.maps import make_map_name
 from pipelines.preprocess.sources.opendrive.reference_line import KINDS, NO_CUBICS, Cubics, Geometry, ReferenceLine
 
 SUFFIXES = (".xodr", ".xodr.gz")
@@ -117,42 +117,6 @@ class SkippedError(ValueError):
     """Raised for an element that cannot be read. The message states the reason."""
 
 
-def list_maps(inputs: Iterable[str]) -> list[str]:
-    """Return the paths of OpenDRIVE files.
-
-    Args:
-        inputs: Files, or directories that contain files with a suffix of SUFFIXES.
-
-    Returns:
-        Paths of the files.
-
-    Raises:
-        ValueError: A path does not exist, a directory has no OpenDRIVE file, or two files have the same name.
-    """
-    found: dict[str, str] = {}
-    for text in inputs:
-        path = make_input_path(text)
-        paths: list[InputPath] = [path]
-        if path.is_dir():
-            paths = sorted(child for child in path.glob("*") if child.name.endswith(SUFFIXES))
-        elif not path.is_file():
-            raise ValueError(f"--input {path}: no such file or directory; {GET_FILE}")
-        if not paths:
-            raise ValueError(f"--input {path} contains no OpenDRIVE file ({', '.join(SUFFIXES)})")
-        for file in paths:
-            name = make_name(file)
-            if name in found:
-                raise ValueError(f"{file} and {found[name]} would both be named {name}; rename one of the files")
-            found[name] = str(file)
-    return list(found.values())
-
-
-def make_name(path: InputPath) -> str:
-    """Return the name of a file without suffixes. Characters that scene ids cannot contain become underscores."""
-    name = path.name.removesuffix(".gz").removesuffix(".xodr")
-    return re.sub(r"[^A-Za-z0-9._-]", "_", name) or "map"
-
-
 def read_map(path: str | PathLike) -> Map:
     """Read an OpenDRIVE file.
 
@@ -184,7 +148,7 @@ def read_map(path: str | PathLike) -> Map:
     notice = None if header is None else header.find("userData[@code='attribution']")
     attribution = None if notice is None else (notice.get("value") or "")[: find_limit("text_characters")]
     projection = " ".join((reference.text or "").split())[:500] if reference is not None else ""
-    return Map(make_name(source), projection, attribution or None, roads, skipped)
+    return Map(make_map_name(source, SUFFIXES), projection, attribution or None, roads, skipped)
 
 
 def _parse_xml(source: InputPath) -> Element:

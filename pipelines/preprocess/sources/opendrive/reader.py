@@ -15,11 +15,10 @@ import shapely
 
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES, Grid, Scene, make_yaw_rotation
 from pipelines.preprocess.sources.drive import HIDDEN, STATIC, Drive, LayeredGround
+from pipelines.preprocess.sources.maps import make_world_from_imu, order_by_squares
 from pipelines.preprocess.sources.opendrive.file import read_map
 from pipelines.preprocess.sources.opendrive.lanes import LAYERS, LanePoses, make_lane_poses, triangulate_lanes
 from pipelines.preprocess.sources.opendrive.objects import Box, MapObjects, make_objects
-from pipelines.preprocess.sources.osm.roads import order_by_squares
-from pipelines.preprocess.sources.town.world import IMU_HEIGHT_M
 
 SOURCE = "opendrive"
 
@@ -94,7 +93,7 @@ def read_drive(path: str, options: OpenDriveOptions) -> tuple[Drive, dict]:
         ground_classes=KITTI_GROUND_CLASSES,
         ground=make_ground(triangulate_lanes(roads), found),
         frame=np.arange(len(poses.yaw_rad)),
-        world_from_imu=_make_world_from_imu(poses),
+        world_from_imu=make_world_from_imu(poses.xyz_m, poses.yaw_rad),
         attribution=roads.attribution,
     )
     return drive, {
@@ -136,14 +135,6 @@ def make_ground(lanes: tuple[np.ndarray, np.ndarray], found: MapObjects) -> Laye
 def _order(poses: LanePoses) -> LanePoses:
     order = order_by_squares(poses.xyz_m[:, :2])
     return LanePoses(poses.xyz_m[order], poses.yaw_rad[order])
-
-
-def _make_world_from_imu(poses: LanePoses) -> np.ndarray:
-    """Return pose matrices (p, 3, 4) with the axes x forward, y right and z down, IMU_HEIGHT_M above the road."""
-    cos, sin = np.cos(poses.yaw_rad), np.sin(poses.yaw_rad)
-    zero, one = np.zeros_like(cos), np.ones_like(cos)
-    axes = [np.stack(axis, axis=1) for axis in ((cos, sin, zero), (sin, -cos, zero), (zero, zero, -one))]
-    return np.stack([*axes, poses.xyz_m + [0.0, 0.0, IMU_HEIGHT_M]], axis=2)
 
 
 def _make_boxes(found: list[Box]) -> dict[str, np.ndarray]:

@@ -6,7 +6,6 @@ Mercator (pyproj). Its scale error is less than 1e-4 within MAX_EXTENT_M.
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ import shapely
 
 from models.limits import LimitError, require_within
 from pipelines.preprocess.sources.input_paths import InputPath, find_local_file, make_input_path
+from pipelines.preprocess.sources.maps import make_map_name
 
 SUFFIXES = (".osm", ".osm.gz", ".osm.bz2", ".osm.pbf", ".pbf")
 KEYS = (
@@ -103,44 +103,6 @@ class Extract:
     skipped: Counter[str]
 
 
-def list_extracts(inputs: tuple[str, ...]) -> list[str]:
-    """Return the paths of extracts.
-
-    Args:
-        inputs: Files, or directories that contain files with a suffix of SUFFIXES.
-
-    Returns:
-        Paths of the files.
-
-    Raises:
-        ValueError: A path does not exist, a directory has no extract, or two extracts have the same name.
-    """
-    found: dict[str, str] = {}
-    for text in inputs:
-        path = make_input_path(text)
-        paths = [path]
-        if path.is_dir():
-            paths = sorted(child for child in path.glob("*") if child.name.endswith(SUFFIXES))
-        elif not path.is_file():
-            raise ValueError(f"--input {path}: no such file or directory; {GET_EXTRACT}")
-        if not paths:
-            raise ValueError(f"--input {path} contains no extract of OpenStreetMap ({', '.join(SUFFIXES)})")
-        for extract in paths:
-            name = make_name(extract)
-            if name in found:
-                raise ValueError(f"{extract} and {found[name]} would both be named {name}; rename one of the files")
-            found[name] = str(extract)
-    return list(found.values())
-
-
-def make_name(path: InputPath) -> str:
-    """Return the name of a file without suffixes. Characters that scene ids cannot contain become underscores."""
-    name = path.name
-    for suffix in sorted(SUFFIXES, key=len, reverse=True):
-        name = name.removesuffix(suffix)
-    return re.sub(r"[^A-Za-z0-9._-]", "_", name) or "extract"
-
-
 def read_extract(path: str | PathLike, region: Region | None = None, only_roads: bool = False) -> Extract:
     """Read the features of a region.
 
@@ -196,7 +158,9 @@ def read_extract(path: str | PathLike, region: Region | None = None, only_roads:
     for index in np.flatnonzero(kept).tolist():
         identity, tags, nodes = records[index]
         found[keys[index]].append(Feature(identity, tags, geometries[index], nodes))
-    return Extract(make_name(source), projection, box_m, found["point"], found["line"], found["area"], skipped)
+    return Extract(
+        make_map_name(source, SUFFIXES), projection, box_m, found["point"], found["line"], found["area"], skipped
+    )
 
 
 Record = tuple[int, dict[str, str], tuple[int, ...]]

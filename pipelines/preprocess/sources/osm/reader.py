@@ -17,12 +17,13 @@ import shapely
 
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES, make_yaw_rotation
 from pipelines.preprocess.sources.drive import STATIC, Drive
+from pipelines.preprocess.sources.maps import make_world_from_imu
 from pipelines.preprocess.sources.osm.buildings import cover_footprint, repair_polygons
 from pipelines.preprocess.sources.osm.extract import Extract, Feature, Region, read_extract
 from pipelines.preprocess.sources.osm.furnish import furnish_streets
 from pipelines.preprocess.sources.osm.ground import LayerPolygon, list_ground, make_ground
 from pipelines.preprocess.sources.osm.objects import Box, make_objects
-from pipelines.preprocess.sources.osm.roads import StreetPoses, list_roads, make_street_poses, make_world_from_imu
+from pipelines.preprocess.sources.osm.roads import StreetPoses, list_roads, make_street_poses
 from pipelines.preprocess.sources.osm.tags import GARAGES, find_heights, is_underground
 
 SOURCE = "osm"
@@ -107,7 +108,7 @@ def read_drive(path: str, options: OsmOptions) -> tuple[Drive, dict]:
         ground_classes=KITTI_GROUND_CLASSES,
         ground=make_ground(ground),
         frame=np.arange(len(poses.xy_m)),
-        world_from_imu=make_world_from_imu(poses),
+        world_from_imu=make_world_from_imu(np.pad(poses.xy_m, ((0, 0), (0, 1))), poses.yaw_rad),
         free_pose=poses.is_free,
     )
     named = Counter(box.label for box in objects)

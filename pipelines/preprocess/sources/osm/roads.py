@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 
+from pipelines.preprocess.sources.maps import order_by_squares
 from pipelines.preprocess.sources.osm.extract import Extract
 from pipelines.preprocess.sources.osm.tags import STREETS, Profile, Tags, find_profile, is_underground
-from pipelines.preprocess.sources.town.world import IMU_HEIGHT_M
 from pipelines.schema.splits import CROP_AHEAD_M
 
-SQUARE_M = 256.0  # Side of the squares that order the poses.
 FREE_OFFSET_M = 30.0  # Largest distance of the middle of a free crop from a pose on a road.
 
 
@@ -133,22 +132,6 @@ def _draw_free_poses(xy: np.ndarray, share: float, seed: int) -> tuple[np.ndarra
     yaw = rng.uniform(-np.pi, np.pi, count)
     middle = xy[rng.integers(0, max(1, len(xy)), count)] + rng.uniform(-FREE_OFFSET_M, FREE_OFFSET_M, (count, 2))
     return middle - CROP_AHEAD_M * np.stack([np.cos(yaw), np.sin(yaw)], axis=1), yaw
-
-
-def order_by_squares(xy_m: np.ndarray) -> np.ndarray:
-    """Return an order (p,) that groups points by square; the squares follow a serpentine order."""
-    square = np.floor(xy_m / SQUARE_M).astype(np.int64)
-    column = np.where(square[:, 1] % 2 == 0, square[:, 0], -square[:, 0])
-    return np.lexsort([np.arange(len(xy_m)), column, square[:, 1]])
-
-
-def make_world_from_imu(poses: StreetPoses) -> np.ndarray:
-    """Return pose matrices (p, 3, 4) with the axes x forward, y right and z down, IMU_HEIGHT_M above the ground."""
-    cos, sin = np.cos(poses.yaw_rad), np.sin(poses.yaw_rad)
-    zero, one = np.zeros_like(cos), np.ones_like(cos)
-    forward, right = np.stack([cos, sin, zero], axis=1), np.stack([sin, -cos, zero], axis=1)
-    position = np.column_stack([poses.xy_m, np.full(len(cos), IMU_HEIGHT_M)])
-    return np.stack([forward, right, np.stack([zero, zero, -one], axis=1), position], axis=2)
 
 
 class NearestRoads:
