@@ -8,6 +8,7 @@
 #   make test        all tests but slow ones
 #   make test-slow   long checks, marked slow
 #   make docs        the documentation site in build/site; executes the tutorials
+#   make py123d-env  an environment with py123d in .venv-py123d, which converts further datasets
 #   make coverage    make test with line coverage, without lines in Ray's processes; half as long again
 PYTHON ?= python3
 BIN := .venv/bin
@@ -26,7 +27,7 @@ export OMP_WAIT_POLICY ?= PASSIVE
 unexport PYTHONDONTWRITEBYTECODE
 
 TESTS := test test-fast test-slow coverage
-.PHONY: demo paper-kitti360 paper-av2 lint docs $(TESTS) browser clean
+.PHONY: demo paper-kitti360 paper-av2 lint docs $(TESTS) browser py123d-env clean
 demo: .venv/ready
 	$(BIN)/python jobs/run_demo.py --output runs/demo
 
@@ -83,5 +84,12 @@ browser:
 	-command -v npm >/dev/null && npm install --silent --no-fund --no-audit --prefix .venv/npm gltf-validator@2.0.0-dev.3.10
 	touch $@
 
+# py123d needs an older trimesh than this project. The maps of CARLA in its wheel are read by tests.
+py123d-env: .venv/ready
+	test -x .venv-py123d/bin/python || $(PYTHON) -m venv .venv-py123d
+	UV_SYSTEM_CERTS=1 $(BIN)/uv pip install -q -p .venv-py123d/bin/python \
+	  $${PIP_INDEX_URL:+--default-index "$$PIP_INDEX_URL"} py123d==0.7.0 || \
+	  .venv-py123d/bin/python -m pip install --disable-pip-version-check -q py123d==0.7.0
+
 clean:
-	rm -rf .venv runs build dist *.egg-info .coverage
+	rm -rf .venv .venv-py123d runs build dist *.egg-info .coverage

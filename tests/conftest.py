@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import importlib.util
 import json
 import os
 import re
@@ -115,6 +116,18 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
 
     config.option.loadscopereorder = False  # keep the order of pytest_collection_modifyitems
     return SmokeScheduling(config, log)
+
+
+@pytest.fixture(scope="session")
+def carla_maps() -> Path:
+    """Folder with the OpenDRIVE maps of CARLA in the wheel of py123d, which is a package of its own environment."""
+    spec = importlib.util.find_spec("py123d")
+    packages = [Path(spec.origin).parent] if spec and spec.origin else []
+    packages += sorted((ROOT / ".venv-py123d").glob("lib/python*/site-packages/py123d"))
+    folders = [folder for package in packages if (folder := package / "parser" / "opendrive" / "carla_maps").is_dir()]
+    if not folders:
+        pytest.skip("no maps of CARLA: they are part of the wheel of py123d; run 'make py123d-env'")
+    return folders[0]
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,7 @@ from pipelines.preprocess.sharding import plan_opendrive
 from pipelines.preprocess.sources.drive import Drive, Pose
 from pipelines.preprocess.sources.maps import list_map_files
 from pipelines.preprocess.sources.opendrive.file import GET_FILE, SUFFIXES, Map, Road, read_map
-from pipelines.preprocess.sources.opendrive.lanes import list_strips
+from pipelines.preprocess.sources.opendrive.lanes import LAYERS, list_strips
 from pipelines.preprocess.sources.opendrive.reader import OpenDriveOptions, read_drive, read_poses
 from pipelines.preprocess.sources.opendrive.reference_line import NO_CUBICS, Cubics, Geometry, ReferenceLine
 from pipelines.preprocess.sources.town.version2.town import make_large_crops
@@ -214,10 +214,10 @@ def find_lane_middle(road: Road, lane: int, at_end: bool) -> np.ndarray | None:
     return None
 
 
-def test_real_lanes_meet_their_successors(real_data):
-    path = str(real_data / "opendrive" / "ingolstadt-city-hall.xodr.gz")
-    roads = {road.id: road for road in read_map(path).roads}
-    root = ElementTree.fromstring(gzip.decompress(Path(path).read_bytes()))
+def measure_gaps(path: Path) -> np.ndarray:
+    """Return the distances between the middles of driving lanes and of their successors (m)."""
+    roads = {road.id: road for road in read_map(str(path)).roads}
+    root = ElementTree.fromstring(gzip.decompress(path.read_bytes()))
     gaps = []
     for element in root.iter("road"):
         link = element.find("link/successor[@elementType='road']")
@@ -234,7 +234,32 @@ def test_real_lanes_meet_their_successors(real_data):
                     ),
                 )
                 gaps.append(np.linalg.norm(np.subtract(*ends)))
+    return np.array(gaps)
+
+
+def test_real_lanes_meet_their_successors(real_data):
+    gaps = measure_gaps(real_data / "opendrive" / "ingolstadt-city-hall.xodr.gz")
     assert len(gaps) > 40 and np.median(gaps) < 0.01 and np.percentile(gaps, 90) < 0.1
+
+
+@pytest.mark.parametrize("town", ["Town03", "Town07", "Town10HD"])
+def test_town_of_carla_keeps_its_content(carla_maps, town):
+    path = carla_maps / f"{town}.xodr.gz"
+    drive, report = read_drive(str(path), OpenDriveOptions())
+    root = ElementTree.fromstring(gzip.decompress(path.read_bytes()))
+    damaged = sum(n for reason, n in report["skipped"].items() if "finite number" in reason)  # "-1.0499979e" in Town03
+    assert report["roads"] + damaged == len(list(root.iter("road"))) and damaged <= 1
+    length = sum(float(road.get("length")) for road in root.iter("road") if road.get("junction") == "-1")
+    assert report["length_m"] == pytest.approx(length, abs=0.06, rel=0.001 * damaged)
+    gaps = measure_gaps(path)
+    assert len(gaps) > 20 and np.median(gaps) < 0.01 and np.percentile(gaps, 90) < 0.1
+    spaces = [element for element in root.iter("object") if element.find("parkingSpace") is not None]
+    area = sum(float(one.get("width")) * float(one.get("length")) for one in spaces)
+    corners = drive.ground.triangles_m[drive.ground.triangle_layer == LAYERS.index("parking"), :, :2]
+    sides = corners[:, 1:] - corners[:, :1]
+    triangles = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]) / 2
+    assert triangles.sum() >= 0.99 * area
+    assert all(drive.at(np.array([k])).scene(0).occupied[0].mean() > 0.02 for k in range(0, len(drive), 50))
 
 
 @pytest.mark.slow

@@ -22,6 +22,8 @@ LIGHT_M = (0.3, 0.3, 0.9)
 POLE_REACH_M = 1.0  # A signal farther than this from every pole gets a pole.
 LOW_SIGNAL_M = 0.5  # Signals below this height are marks on the road.
 
+PARKING = ("parkingSpace", "parking")  # Standard type, and type in the maps of CARLA.
+
 # Category of each value of the attribute type (OpenDRIVE 1.4 to 1.8).
 TYPES = {
     "building": "construction_big",
@@ -129,9 +131,8 @@ def make_objects(roads: Map, skipped: Counter[str]) -> MapObjects:
 def _add_object(road: Road, element: Element, found: MapObjects, skipped: Counter[str]) -> None:
     kind, name = element.get("type", "none"), element.get("name", "")
     outline = _read_outline(road, element)
-    if kind == "parkingSpace":
-        if outline is not None:
-            found.parking.append(outline)
+    if kind in PARKING:
+        found.parking.append(_make_rectangle(road, element) if outline is None else outline)
         return
     category = TYPES.get(kind)
     if category is None:
@@ -162,6 +163,16 @@ def _find_place(road: Road, element: Element) -> tuple[np.ndarray, float]:
     # Some files state the height above sea level instead of the height above the road.
     foot[2] += z if abs(z) < 100.0 else 0.0
     return foot, float(direction[0]) + read_number(element, "hdg", 0.0)
+
+
+def _make_rectangle(road: Road, element: Element) -> np.ndarray:
+    """Return the corners (4, 3) of an object that has a length and a width (m)."""
+    foot, yaw = _find_place(road, element)
+    along, across = (read_number(element, name) / 2 for name in ("length", "width"))
+    if not (MIN_SIZE_M < 2 * along < MAX_SIZE_M and MIN_SIZE_M < 2 * across < MAX_SIZE_M):
+        raise SkippedError("parking space without a size")
+    corners = np.array([[along, across, 0], [-along, across, 0], [-along, -across, 0], [along, -across, 0]])
+    return foot + corners @ make_yaw_rotation(yaw).T
 
 
 def _read_height(element: Element, category: str) -> float:
