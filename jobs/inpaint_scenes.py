@@ -5,6 +5,8 @@
     jobs/inpaint_scenes.py --half-plane 1 0 32 --num-variants 4          everything at least 32 m ahead, four variants
     jobs/inpaint_scenes.py --primitives 3 17 --contents objects          objects around primitives 3 and 17, same ground
     jobs/inpaint_scenes.py --half-plane 1 0 -99 --contents objects       new objects on the same ground
+    jobs/inpaint_scenes.py --half-plane 1 0 -99 --contents objects --keep-categories construction_big
+                                                                         the same between the given buildings
     jobs/inpaint_scenes.py --polygon-m ... --inpainting repaint          as in the paper, slowly
 
 Regions are enlarged to whole latent cells. The job writes scene tables with source=generated-<run>, one GLB file per
@@ -37,6 +39,9 @@ class Config(RePaintOptions):
     """Regenerate the area outside the region instead of the area inside it."""
     contents: Literal["both", "ground", "objects"] = "both"
     """Content to regenerate in the region."""
+    keep_categories: tuple[str, ...] = ()
+    """Categories whose objects are kept in the region, such as construction_big for buildings. The model generates the
+    other objects around them (default: none)."""
     num_variants: int = 1
     """Number of different results per scene."""
     output: str = ""

@@ -10,7 +10,14 @@ import torch
 from models.composition.block_grid import BlockIndex, choose_arrangement, label_blocks
 from models.composition.extend import Side, extend_scene
 from models.composition.generator import StepCallback
-from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
+from models.composition.inpaint import (
+    Contents,
+    composite_scenes,
+    grow_to_cells,
+    hide_replaced_objects,
+    make_latent_mask,
+    select_kept_pixels,
+)
 from models.composition.outpaint import count_planned_cells, outpaint_scene, uses_street_plan
 from models.composition.road_sketch import SketchedRoad, Streets
 from models.composition.street_plan import StreetPlan, convert_label
@@ -40,6 +47,8 @@ class PrITTIPipeline(SamplingPipeline):
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
         callback_on_step_end: StepCallback | None = None,
         composite: bool = True,
+        keep: Sequence[str] = (),
+        kept_pixels: Sequence[np.ndarray] | None = None,
     ) -> list[Scene]:
         """Regenerate a region of each scene; regions are enlarged to whole latent cells (paper, Sec. 3.3).
 
@@ -59,22 +68,34 @@ class PrITTIPipeline(SamplingPipeline):
             callback_on_step_end: See `generate`.
             composite: If True, copy everything outside the regions from the input. If False, the decoders also
                 reconstruct the area outside the regions.
+            keep: Names of the categories whose objects are kept inside of the regions, such as "construction_big". The
+                model generates the other objects around them.
+            kept_pixels: One mask (rows, cols) per scene of the pixels whose objects are kept. None:
+                `models.composition.inpaint.select_kept_pixels` of the scenes.
 
         Returns:
             The regenerated scenes.
 
         Raises:
-            ValueError: A scene is not on the model's grid, or the latent is not split and `contents` is not "both".
+            ValueError: A scene is not on the model's grid, the latent is not split and `contents` is not "both" or
+                objects are kept, or a kept category is unknown.
         """
         indices = range(len(scenes)) if indices is None else indices
         for scene in scenes:
             self.require_grid(scene)
         if contents != "both" and not self.has_split_latent:
             raise ValueError(f"this model's latent mixes ground and objects, so it cannot regenerate only {contents}")
+        if keep and not self.has_split_latent:
+            raise ValueError("this model's latent mixes ground and objects, so it cannot keep objects of a region")
         shape = self.latent_shape
-        mask = make_latent_mask(regions, shape, contents).to(self.device)
+        kept: Sequence[np.ndarray] = kept_pixels or ()
+        if keep and kept_pixels is None:
+            kept = [select_kept_pixels(scene, keep, scene.grid.rows // shape[-1]) for scene in scenes]
+        mask = make_latent_mask(regions, shape, contents, kept).to(self.device)
         seeds = draw_seeds(generator, seed, len(scenes))
-        condition = InpaintCondition(self.encode(scenes), mask)
+        cells = [grow_to_cells(region, scene.grid, shape[-1]) for scene, region in zip(scenes, regions, strict=True)]
+        known = [hide_replaced_objects(*pair, keep) for pair in zip(scenes, cells, strict=True)] if keep else scenes
+        condition = InpaintCondition(self.encode(known), mask)
         latents = self.inpaint_latents(
             condition,
             labels,
@@ -89,8 +110,8 @@ class PrITTIPipeline(SamplingPipeline):
         if not composite:
             return generated
         return [
-            composite_scenes(scene, new, grow_to_cells(region, scene.grid, shape[-1]), contents)
-            for scene, new, region in zip(scenes, generated, regions, strict=True)
+            composite_scenes(scene, new, region, contents, keep, pixels)
+            for scene, new, region, pixels in zip(scenes, generated, cells, kept or [None] * len(scenes), strict=True)
         ]
 
     def outpaint(

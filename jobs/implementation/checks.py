@@ -6,8 +6,11 @@ for an invalid option. The implementations also call these functions.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from jobs.encode_latents import Config as EncodeConfig
 from jobs.evaluate_scenes import Config as EvaluateConfig
+from jobs.furnish_place import Config as FurnishConfig
 from jobs.implementation.protocols import PROTOCOLS, apply_protocol
 from jobs.inpaint_scenes import Config as InpaintConfig
 from jobs.outpaint_scenes import Config as OutpaintConfig
@@ -24,6 +27,7 @@ from models.scene import CATEGORIES, VEGETATION, VEHICLES
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 
+MAX_PLACE_M = 1024.0
 DENSITY_GROUPS = {"vegetation": VEGETATION, "vehicle": VEHICLES}  # Categories that each density label counts.
 
 
@@ -159,6 +163,23 @@ def check_map(config: Osm | OpenDrive) -> None:
             raise ValueError(f"--{name.replace('_', '-')} is {value:g}, expected 0 to {largest:g}")
 
 
+def check_furnish_place(config: FurnishConfig) -> None:
+    require_positive(config, "size_m", "num_variants", "num_actors")
+    if config.size_m > MAX_PLACE_M:
+        raise ValueError(f"--size-m is {config.size_m:g}, expected at most {MAX_PLACE_M:g}; furnish several places")
+    if len(config.origin) % 2:
+        raise ValueError(f"--origin has {len(config.origin)} numbers, expected pairs such as 52.4737 13.4399")
+    require_categories("keep_categories", config.keep_categories)
+    require_model_labels(find_pipeline_directory(config.model), [config.label] if config.label else [])
+
+
+def require_categories(name: str, categories: Sequence[str]) -> None:
+    """Raise an error if an option names an unknown category."""
+    if unknown := [category for category in categories if category not in CATEGORIES]:
+        option = name.replace("_", "-")
+        raise ValueError(f"--{option} {unknown[0]}, expected some of: {', '.join(CATEGORIES)}")
+
+
 def check_sample_scenes(config: SampleConfig) -> None:
     require_positive(config, "num_scenes", "num_inference_steps", "num_actors", "batch_size", "decode_batch_size")
     require_model_labels(find_pipeline_directory(config.model), config.labels)
@@ -176,6 +197,9 @@ def check_inpaint_scenes(config: InpaintConfig) -> None:
         raise ValueError(f"--num-examples is {config.num_examples}, expected 0 or more")
     if config.polygon_m and (len(config.polygon_m) % 2 or len(config.polygon_m) < 6):
         raise ValueError(f"--polygon-m has {len(config.polygon_m)} numbers, expected x and y of at least three corners")
+    require_categories("keep_categories", config.keep_categories)
+    if config.keep_categories and config.contents == "ground":
+        raise ValueError("--keep-categories has no effect with --contents ground, which keeps all objects; omit it")
     require_model_labels(find_pipeline_directory(config.model), [config.label] if config.label else [])
 
 

@@ -33,6 +33,7 @@ def inpaint(config: Config) -> dict[str, float | None]:
         execution=make_execution(config),
         guidance_scale=config.guidance_scale,
         constraints=config.constraints,
+        keep=config.keep_categories,
     )
     with hold_output(request.output, request.source, config), JobProgress() as bar:
         shown = bar.add_task("inpaint", total=total)

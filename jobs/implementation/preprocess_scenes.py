@@ -43,7 +43,13 @@ def make_osm_options(config: Osm) -> OsmOptions:
         config.drive_on == "left",
         config.furnish,
         config.seed,
+        find_unmapped_ground(config),
     )
+
+
+def find_unmapped_ground(config: Osm | OpenDrive) -> str | None:
+    """Return the ground class of land that a map leaves open."""
+    return None if config.unmapped_ground == "none" else config.unmapped_ground
 
 
 def plan_shards(config: Config) -> list:
@@ -56,7 +62,9 @@ def plan_shards(config: Config) -> list:
         return sharding.plan_osm(inputs, make_osm_options(config), config.test_share)
     if isinstance(config, OpenDrive):
         inputs = tuple(make_absolute(path) for path in config.input)
-        return sharding.plan_opendrive(inputs, OpenDriveOptions(config.spacing_m), config.test_share)
+        return sharding.plan_opendrive(
+            inputs, OpenDriveOptions(config.spacing_m, find_unmapped_ground(config)), config.test_share
+        )
     root = make_absolute(config.input)
     if isinstance(config, Av2):
         return sharding.plan_argoverse2(root)
@@ -74,6 +82,8 @@ def make_recorded_options(config: Config) -> dict:
         slots = config.slots or ("p99.5" if config.town_version > 1 else "p95")
         return {name: value for name, value in options.items() if name != "free_pose_share"} | share | {"slots": slots}
     if isinstance(config, Osm | OpenDrive):
+        if config.unmapped_ground == "none":  # Earlier versions had no such option.
+            del options["unmapped_ground"]
         return options | {"input": [make_absolute(path) for path in config.input]}
     return options | {"input": make_absolute(config.input)}
 

@@ -10,7 +10,14 @@ import numpy as np
 
 from models.composition.block_grid import BlockGrid
 from models.composition.generator import SceneGenerator, StepCallback
-from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
+from models.composition.inpaint import (
+    Contents,
+    composite_scenes,
+    grow_to_cells,
+    hide_replaced_objects,
+    make_latent_mask,
+    select_kept_pixels,
+)
 from models.composition.outpaint import find_ground_height
 from models.composition.seam_blending import extract_new_part, extrapolate_ground
 from models.sampling.diffusion import OUTPAINT, InpaintCondition
@@ -194,6 +201,7 @@ def inpaint_blocks(
     repaint: InpaintingConfig | None = None,
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
+    keep: Sequence[str] = (),
 ) -> Iterator[InpaintStep]:
     """Regenerate a region of a large scene block by block, with one variant per index.
 
@@ -211,6 +219,7 @@ def inpaint_blocks(
         repaint: Options of inpainting; None: see `resolve_inpainting`.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
+        keep: Names of the categories whose objects are kept inside of the region.
 
     Yields:
         One step per block. The last step contains the finished scenes in `canvases`.
@@ -221,6 +230,9 @@ def inpaint_blocks(
     if not region.any():
         raise ValueError(f"{scene}: the region contains no pixel of this scene")
     canvases, level_m = [scene] * len(indices), find_ground_height(scene, 0.0, 0.0)
+    kept = select_kept_pixels(scene, keep, model.spec.grid.rows // model.latent_shape[-1]) if keep else None
+    if keep:  # Objects of blocks that are regenerated later are not known.
+        canvases = [hide_replaced_objects(scene, region, keep)] * len(indices)
     for number, (window, part) in enumerate(split_region(model, scene, region)):
         blocks = [to_block_frame(canvas, window, model.spec.grid, level_m) for canvas in canvases]
         known = [block for block, _ in blocks]
@@ -235,11 +247,13 @@ def inpaint_blocks(
             guidance_scale,
             callback_on_step_end=callback_on_step_end,
             composite=False,
+            keep=keep,
+            kept_pixels=None if kept is None else [kept[scene.grid.intersect(window)[0]]] * len(known),
         )
         inside = np.zeros_like(region)
         inside[scene.grid.intersect(window)[0]] = part
         canvases = [
-            composite_scenes(canvas, new.translate(*offset_m).crop(scene.grid), inside, contents)
+            composite_scenes(canvas, new.translate(*offset_m).crop(scene.grid), inside, contents, keep, kept)
             for canvas, new, (_, offset_m) in zip(canvases, generated, blocks, strict=True)
         ]
         yield InpaintStep(known, generated, part, canvases)

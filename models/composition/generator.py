@@ -209,6 +209,8 @@ class SceneGenerator(Protocol):
         *,
         callback_on_step_end: StepCallback | None = None,
         composite: bool = True,
+        keep: Sequence[str] = (),
+        kept_pixels: Sequence[np.ndarray] | None = None,
     ) -> list[Scene]:
         """Regenerate regions of scenes (see `PrITTIPipeline.inpaint`).
 
@@ -223,6 +225,8 @@ class SceneGenerator(Protocol):
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `PrITTIPipeline.generate`.
             composite: If True, copy everything outside the regions from the input.
+            keep: Names of the categories whose objects are kept inside of the regions.
+            kept_pixels: One mask (rows, cols) per scene of the pixels with kept objects; None: those of the scenes.
 
         Returns:
             The regenerated scenes.

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from models.composition.deduplicate import find_regenerated_objects
 from models.composition.seam_blending import blend_ground
-from models.scene import Grid, Scene, concatenate_primitives, make_yaw_rotation, merge_scenes
+from models.scene import CATEGORY_INDEX, Grid, Scene, concatenate_primitives, make_yaw_rotation, merge_scenes
 
 Contents = Literal["both", "ground", "objects"]  # Part of the scene to regenerate inside a region.
 
@@ -145,7 +145,62 @@ def grow_to_cells(region: np.ndarray, grid: Grid, size: int) -> np.ndarray:
     return grid.upsample_cells(find_region_cells(region, size))
 
 
-def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int], contents: Contents | str) -> Tensor:
+SOLID = ("construction_big", "construction_small", "vehicle_big", "vehicle_small")  # No object fits inside of these.
+
+
+def find_kept_objects(scene: Scene, keep: Sequence[str]) -> np.ndarray:
+    """Find the objects of some categories.
+
+    Args:
+        scene: Scene.
+        keep: Names of categories.
+
+    Returns:
+        (n,) bool.
+
+    Raises:
+        ValueError: A name is no category.
+    """
+    if unknown := [name for name in keep if name not in CATEGORY_INDEX]:
+        raise ValueError(f"category {unknown[0]!r}, expected some of: {', '.join(CATEGORY_INDEX)}")
+    return np.isin(scene.category, [CATEGORY_INDEX[name] for name in keep])
+
+
+def select_kept_pixels(scene: Scene, keep: Sequence[str], cell_px: int) -> np.ndarray:
+    """Select the pixels whose objects are known if some categories are kept.
+
+    These are the latent cells that contain the centre of a kept object, and the footprints of kept solid objects (of
+    the categories SOLID), because no other object fits there.
+
+    Args:
+        scene: Scene.
+        keep: Names of the categories whose objects are kept.
+        cell_px: Side of a latent cell in pixels.
+
+    Returns:
+        (rows, cols) bool.
+
+    Raises:
+        ValueError: A name is no category.
+    """
+    kept = scene.select(find_kept_objects(scene, keep))
+    solid = np.flatnonzero(find_kept_objects(kept, SOLID))
+    found = select_around_objects(kept, solid, 0.0)
+    x_m, y_m = kept.center_m[:, 0], kept.center_m[:, 1]
+    inside = scene.grid.contains(x_m, y_m)
+    row, col = scene.grid.pixel(x_m[inside], y_m[inside])
+    at = np.arange(cell_px)
+    row, col = row // cell_px * cell_px, col // cell_px * cell_px
+    found[(row[:, None] + at)[:, :, None], (col[:, None] + at)[:, None, :]] = True
+    return found
+
+
+def make_latent_mask(
+    regions: Sequence[np.ndarray],
+    shape: tuple[int, int, int],
+    contents: Contents | str,
+    kept: Sequence[np.ndarray] = (),
+) -> Tensor:
     """Convert regions to a mask of the latents.
 
     The first half of the channels of a split latent belongs to the ground, the second half to the objects.
@@ -154,6 +209,8 @@ def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int],
         regions: One mask (rows, cols) per scene.
         shape: Shape (c, h, w) of a latent.
         contents: Channels to regenerate: "both", "ground" or "objects".
+        kept: For each scene, the pixels whose objects are kept (`select_kept_pixels`). In cells that consist of such
+            pixels, the object channels are kept.
 
     Returns:
         (b, c, h, w) float32; 1 marks values to regenerate, 0 marks values to keep.
@@ -167,12 +224,39 @@ def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int],
     cells = torch.from_numpy(np.stack([find_region_cells(region, size) for region in regions])).float()
     mask = cells[:, None].repeat(1, channels, 1, 1)
     if contents != "both":
-        kept = slice(channels // 2, None) if contents == "ground" else slice(channels // 2)
-        mask[:, kept] = 0
+        kept_channels = slice(channels // 2, None) if contents == "ground" else slice(channels // 2)
+        mask[:, kept_channels] = 0
+    if len(kept):
+        free = torch.from_numpy(np.stack([find_region_cells(~pixels, size) for pixels in kept])).float()
+        mask[:, channels // 2 :] *= free[:, None]
     return mask
 
 
-def composite_scenes(scene: Scene, generated: Scene, region: np.ndarray, contents: Contents) -> Scene:
+def hide_replaced_objects(scene: Scene, region: np.ndarray, keep: Sequence[str]) -> Scene:
+    """Remove the objects that inpainting replaces.
+
+    Args:
+        scene: Scene.
+        region: (rows, cols) bool, in whole latent cells.
+        keep: Names of the categories whose objects are kept.
+
+    Returns:
+        The scene with its objects outside of the region, and with the kept objects inside of it.
+    """
+    inside = np.zeros(len(scene), bool)
+    on_grid = scene.grid.contains(scene.center_m[:, 0], scene.center_m[:, 1])
+    inside[on_grid] = region[scene.grid.pixel(scene.center_m[on_grid, 0], scene.center_m[on_grid, 1])]
+    return scene.select(~inside | find_kept_objects(scene, keep))
+
+
+def composite_scenes(
+    scene: Scene,
+    generated: Scene,
+    region: np.ndarray,
+    contents: Contents,
+    keep: Sequence[str] = (),
+    kept_pixels: np.ndarray | None = None,
+) -> Scene:
     """Combine a scene with its regenerated part; everything outside the region is bit-identical to the input.
 
     Pixels inside the region come from the generated scene. A primitive lies in the region if the pixel under its centre
@@ -187,6 +271,9 @@ def composite_scenes(scene: Scene, generated: Scene, region: np.ndarray, content
         generated: Decoded scene on the same grid.
         region: (rows, cols) bool, in whole latent cells.
         contents: Part of the scene that was regenerated.
+        keep: Names of the categories whose objects are kept inside of the region. The generated scene adds no objects
+            of these categories.
+        kept_pixels: (rows, cols) bool; the generated scene adds no objects whose centre lies there.
 
     Returns:
         The combined scene.
@@ -196,6 +283,11 @@ def composite_scenes(scene: Scene, generated: Scene, region: np.ndarray, content
     kept = merge_scenes([scene], [~objects], scene)
     generated = blend_ground(generated.select(~find_regenerated_objects(generated, kept)), scene, ground)
     of_ground = merge_scenes([scene, generated], [~ground, ground], scene)
-    new = merge_scenes([generated], [objects], scene)
+    if keep:
+        kept_inside = scene.select(find_kept_objects(scene, keep))
+        kept = replace(kept, **concatenate_primitives([kept, merge_scenes([kept_inside], [objects], scene)]))
+        generated = generated.select(~find_kept_objects(generated, keep))
+    free = objects if kept_pixels is None else objects & ~kept_pixels
+    new = merge_scenes([generated], [free], scene)
     both = concatenate_primitives([kept, new])
     return replace(scene, height_m=of_ground.height_m, occupied=of_ground.occupied, **both)

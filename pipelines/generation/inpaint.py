@@ -18,9 +18,11 @@ from models.scene import Scene, merge_scenes
 from pipelines.generation.sample import (
     Request,
     find_scene_label,
+    from_model_surface,
     guard_generation_run,
     load_pipeline,
     resample_to_model_resolution,
+    to_model_surface,
 )
 from pipelines.io.mesh_export import export_glb
 from pipelines.metrics.reconstruction import sum_pairs
@@ -98,6 +100,7 @@ class InpaintRequest(Request):
         guidance_scale: Scale of classifier-free guidance.
         execution: How the model runs.
         constraints: Whether constraints guide sampling. None: the value that the model stores.
+        keep: Names of the categories whose objects are kept inside of the region.
     """
 
     where: RegionConfig
@@ -109,6 +112,7 @@ class InpaintRequest(Request):
     guidance_scale: float
     execution: SamplingExecution = field(default_factory=SamplingExecution)
     constraints: bool | None = None
+    keep: tuple[str, ...] = ()
 
 
 def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
@@ -177,7 +181,8 @@ def inpaint_one(
     Raises:
         ValueError: The region contains no pixel of the scene, or the scene has no label and the request has none.
     """
-    scene, count = resample_to_model_resolution(scene, pipeline.spec), request.variants
+    scene = resample_to_model_resolution(to_model_surface(scene, pipeline.spec), pipeline.spec)
+    count = request.variants
     drifts: list[dict[str, float]] = []
     for step in inpaint_blocks(
         pipeline,
@@ -189,6 +194,7 @@ def inpaint_one(
         range(number * count, (number + 1) * count),
         request.repaint,
         request.guidance_scale,
+        keep=request.keep,
     ):
         drifts += [
             compute_drift(known, raw, step.region) for known, raw in zip(step.known, step.generated, strict=True)
@@ -241,7 +247,8 @@ class Inpainter:
         made, drifts = inpaint_one(self.pipeline, request, source.scenes([position])[0], row["id"])
         for scene in made:
             path = storage.join_uri(request.output, "glb", request.run, f"{make_file_name(scene.scene_id)}.glb")
-            storage.write_whole(path, lambda stream, scene=scene: stream.write(export_glb(scene)))
+            shown = from_model_surface(scene, source.source, self.pipeline.spec)
+            storage.write_whole(path, lambda stream, scene=shown: stream.write(export_glb(scene)))
         storage.write_json(drifts, make_drift_path(request, row["id"]))
         shard.write(made)
         return {"id": row["id"]}
@@ -306,7 +313,8 @@ def inpaint_scenes(
 
     def list_examples() -> Iterator[InpaintExample]:
         for number, (source, position) in enumerate(chosen[:pictures]):
-            given = resample_to_model_resolution(source.scenes([position])[0], pipeline.spec)
+            given = to_model_surface(source.scenes([position])[0], pipeline.spec)
+            given = resample_to_model_resolution(given, pipeline.spec)
             region = find_regenerated_pixels(pipeline, given, request.where)
             yield InpaintExample(given, region, request.shard(number).scenes())
 

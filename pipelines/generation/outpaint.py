@@ -39,6 +39,7 @@ from pipelines.generation.sample import (
     guard_generation_run,
     load_pipeline,
     resample_to_model_grid,
+    to_model_surface,
 )
 from pipelines.generation.street_plans import (
     Part,
@@ -318,7 +319,7 @@ class Outpainter:
             Scene.
         """
         shard, row = self.chosen[number]
-        return resample_to_model_grid(shard.scenes([row])[0], self.pipeline.spec)
+        return resample_to_model_grid(to_model_surface(shard.scenes([row])[0], self.pipeline.spec), self.pipeline.spec)
 
     def load_blocks(
         self, number: int, indices: Sequence[BlockIndex]
@@ -570,7 +571,8 @@ def outpaint_scenes(
         streets: dict[BlockIndex, list[Section]] = {}
         if request.plan_streets:
             shard, row = chosen[number]
-            given = resample_to_model_grid(shard.scenes([row])[0], pipeline.spec)
+            given = to_model_surface(shard.scenes([row])[0], pipeline.spec)
+            given = resample_to_model_grid(given, pipeline.spec)
             plan = make_plan(pipeline, request, given, number)
             grids = {index: composer.find_grid([index]) for index in block_grid.indices() if index != (0, 0)}
             streets = {index: [Section(*k) for k in plan.list_sections(grid)] for index, grid in grids.items()}

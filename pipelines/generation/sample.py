@@ -13,7 +13,7 @@ import torch
 
 from models.execution import SamplingExecution
 from models.labels import LABELS, compose_label, require_labels
-from models.layout import LayoutSpec
+from models.layout import SLAB_OFFSET_M, LayoutSpec
 from models.pipeline import PrITTIPipeline
 from models.sampling.constraints import GuidanceReport
 from models.scene import Grid, Scene
@@ -23,6 +23,7 @@ from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
 from pipelines.runtime.resources import find_device
 from pipelines.schema.columns import SCENE_TABLES
+from pipelines.schema.dataset import SURFACE
 from pipelines.schema.run_guard import guard_run
 from pipelines.schema.tables import Shard, find_unwritten, require_written
 from pipelines.training.latents import digest_weights
@@ -153,7 +154,7 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
     execution = {"precision": "fp32", "compile": False, "decode_batch_size": 1}
     defaults = {"constraints": False, "pag_scale": 0.0, "repair": False, "execution": execution}
     defaults |= {"labels_map": None, "free_blocks": "none", "tile_m": None, "roads": (), "margin": 0.0}
-    defaults |= {"plan_streets": False}
+    defaults |= {"plan_streets": False, "keep": ()}
     if options.get("plan_streets") and pipeline.street_planner is not None:
         options["street_planner"] = digest_weights(pipeline.street_planner)
     options = {name: value for name, value in options.items() if name not in defaults or value != defaults[name]}
@@ -202,6 +203,43 @@ def resample_to_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
     own, wanted_m = scene.grid, spec.grid.resolution_m
     sides = {name: round(getattr(own, name) * own.resolution_m / wanted_m) for name in ("rows", "cols")}
     return resample_to_model_grid(scene, spec, replace(own, resolution_m=wanted_m, **sides))
+
+
+def to_model_surface(scene: Scene, spec: LayoutSpec) -> Scene:
+    """Convert the ground heights of a real scene to the reference surface of the model (`LayoutSpec.surface`).
+
+    Args:
+        scene: Scene. The heights of generated scenes are not changed, because they have the surface of their model.
+        spec: Layout of the model.
+
+    Returns:
+        The same scene, or a scene whose ground is higher or lower by SLAB_OFFSET_M.
+    """
+    return _raise_ground(scene, find_surface_offset(scene.source, spec))
+
+
+def from_model_surface(scene: Scene, source: str, spec: LayoutSpec) -> Scene:
+    """Convert the ground heights of a generated scene to the reference surface of a source.
+
+    Args:
+        scene: Scene.
+        source: Source of the scene from which it was generated.
+        spec: Layout of the model.
+
+    Returns:
+        The scene.
+    """
+    return _raise_ground(scene, -find_surface_offset(source, spec))
+
+
+def find_surface_offset(source: str, spec: LayoutSpec) -> float:
+    """Return the height of the reference surface of the model above that of a source (m); 0 for generated scenes."""
+    surface = SURFACE.get(source, spec.surface)
+    return spec.slab_offset_m - (SLAB_OFFSET_M if surface == "top" else 0.0)
+
+
+def _raise_ground(scene: Scene, offset_m: float) -> Scene:
+    return replace(scene, height_m=scene.height_m + np.float32(offset_m) * scene.occupied) if offset_m else scene
 
 
 def find_scene_label(scene: Scene, kind: str) -> str:

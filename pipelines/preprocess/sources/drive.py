@@ -1,7 +1,7 @@
 """Define Drive, which holds all annotations along one sequence in the world frame.
 
 Each reader returns a Drive. The same code therefore crops the Scenes of all sources (paper, supplement A, Dataset
-Construction). This module depends only on numpy. The town can therefore be used without ray or pyarrow.
+Construction). This module depends only on numpy and scipy. The town can therefore be used without ray or pyarrow.
 """
 
 from __future__ import annotations
@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from models.limits import require_within
 from models.scene import Grid, Scene, canonicalize_boxes, make_yaw_rotation
@@ -280,11 +281,14 @@ class LayeredGround:
         triangle_layer: Index of each triangle's layer.
         layer_class: Index of each layer's class in the drive's ground_classes, from the top layer to the bottom layer;
             HIDDEN for layers without a class, such as buildings and water, which hide the layers below them.
+        fill_class: Index of the class of places without a layer, at the height of the nearest ground in the crop; None:
+            these places have no ground.
     """
 
     triangles_m: np.ndarray  # (t, 3, 3) float64
     triangle_layer: np.ndarray  # (t,)
     layer_class: tuple[int, ...]
+    fill_class: int | None = None
 
     def near(self, low_m: np.ndarray, high_m: np.ndarray) -> LayeredGround:
         """Select the triangles whose bounding box intersects a rectangle.
@@ -324,6 +328,11 @@ class LayeredGround:
                 height[index][seen] = layer_height[layer][seen]
                 occupied[index] |= seen
             free &= ~covered[layer]
+        if self.fill_class is not None and free.any() and occupied.any():
+            _, (row, col) = cast(tuple, distance_transform_edt(~occupied.any(axis=0), return_indices=True))
+            nearest_m = height.max(axis=0, where=occupied, initial=-np.inf)[row, col]
+            height[self.fill_class][free] = nearest_m[free]
+            occupied[self.fill_class] |= free
         return height, occupied
 
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
+from models.scene import KITTI_GROUND_CLASSES
+from pipelines.preprocess.sources.drive import LayeredGround
 from pipelines.preprocess.sources.input_paths import InputPath, make_input_path
 from pipelines.preprocess.sources.town.world import IMU_HEIGHT_M
 
@@ -51,6 +54,19 @@ def make_map_name(path: InputPath, suffixes: tuple[str, ...]) -> str:
     for suffix in sorted(suffixes, key=len, reverse=True):
         name = name.removesuffix(suffix)
     return re.sub(r"[^A-Za-z0-9._-]", "_", name) or "map"
+
+
+def fill_ground(ground: LayeredGround, name: str | None) -> LayeredGround:
+    """Return the ground with a class for places that the map leaves open.
+
+    Args:
+        ground: Ground with the classes KITTI_GROUND_CLASSES.
+        name: Name of the class; None: no class.
+
+    Returns:
+        The ground.
+    """
+    return ground if name is None else replace(ground, fill_class=KITTI_GROUND_CLASSES.index(name))
 
 
 def order_by_squares(xy_m: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ import shapely
 
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES, Grid, Scene, make_yaw_rotation
 from pipelines.preprocess.sources.drive import HIDDEN, STATIC, Drive, LayeredGround
-from pipelines.preprocess.sources.maps import make_world_from_imu, order_by_squares
+from pipelines.preprocess.sources.maps import fill_ground, make_world_from_imu, order_by_squares
 from pipelines.preprocess.sources.opendrive.file import read_map
 from pipelines.preprocess.sources.opendrive.lanes import LAYERS, LanePoses, make_lane_poses, triangulate_lanes
 from pipelines.preprocess.sources.opendrive.objects import Box, MapObjects, make_objects
@@ -29,9 +29,11 @@ class OpenDriveOptions:
 
     Attributes:
         spacing_m: Distance between successive poses of a lane (m).
+        unmapped_ground: Ground class of land that the file leaves open; None: no class.
     """
 
     spacing_m: float = 10.0
+    unmapped_ground: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +93,7 @@ def read_drive(path: str, options: OpenDriveOptions) -> tuple[Drive, dict]:
         sequence=roads.name,
         **_make_boxes(found.boxes),
         ground_classes=KITTI_GROUND_CLASSES,
-        ground=make_ground(triangulate_lanes(roads), found),
+        ground=fill_ground(make_ground(triangulate_lanes(roads), found), options.unmapped_ground),
         frame=np.arange(len(poses.yaw_rad)),
         world_from_imu=make_world_from_imu(poses.xyz_m, poses.yaw_rad),
         attribution=roads.attribution,

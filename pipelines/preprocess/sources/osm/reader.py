@@ -17,7 +17,7 @@ import shapely
 
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES, make_yaw_rotation
 from pipelines.preprocess.sources.drive import STATIC, Drive
-from pipelines.preprocess.sources.maps import make_world_from_imu
+from pipelines.preprocess.sources.maps import fill_ground, make_world_from_imu
 from pipelines.preprocess.sources.osm.buildings import cover_footprint, repair_polygons
 from pipelines.preprocess.sources.osm.extract import Extract, Feature, Region, read_extract
 from pipelines.preprocess.sources.osm.furnish import furnish_streets
@@ -41,6 +41,7 @@ class OsmOptions:
         drive_on_left: Whether vehicles drive on the left.
         furnish: Whether to add objects and ground that the extract lacks (furnish.py).
         seed: Seed of free poses and of furnished objects.
+        unmapped_ground: Ground class of land that the extract leaves open; None: no class.
     """
 
     region: Region = field(default_factory=Region)
@@ -49,6 +50,7 @@ class OsmOptions:
     drive_on_left: bool = False
     furnish: bool = False
     seed: int = 0
+    unmapped_ground: str | None = None
 
 
 def read_poses(path: str, options: OsmOptions) -> tuple[str, StreetPoses]:
@@ -106,7 +108,7 @@ def read_drive(path: str, options: OsmOptions) -> tuple[Drive, dict]:
         sequence=extract.name,
         **boxes,
         ground_classes=KITTI_GROUND_CLASSES,
-        ground=make_ground(ground),
+        ground=fill_ground(make_ground(ground), options.unmapped_ground),
         frame=np.arange(len(poses.xy_m)),
         world_from_imu=make_world_from_imu(np.pad(poses.xy_m, ((0, 0), (0, 1))), poses.yaw_rad),
         free_pose=poses.is_free,
