@@ -8,8 +8,9 @@
 
 The job reads a square of an extract of OpenStreetMap or of an OpenDRIVE file. It keeps the ground and the buildings,
 and generates parked vehicles, pedestrians, plants, poles, signs and other objects. It writes scene tables with
-source=generated-<run>, one GLB file per scene (<output>/glb/<run>), the scenes of the map (<output>/maps/<run>) and
-<run>.html, which shows both. Run the same command again to resume after an interruption.
+source=generated-<run>, one GLB file per scene (<output>/glb/<run>), pictures of each place before and after
+(<output>/pictures/<run>), the scenes of the map (<output>/maps/<run>) and <run>.html, which shows both from above. Run
+the same command again to resume after an interruption.
 """
 
 from __future__ import annotations

@@ -13,16 +13,20 @@ from jobs.support.options import RePaintOptions
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from models.labels import ANY, mark_free
+from models.layout import LayoutSpec
 from pipelines.generation.inpaint import InpaintRequest, RegionConfig, inpaint_scenes
-from pipelines.generation.sample import load_pipeline
+from pipelines.generation.sample import from_model_surface, load_pipeline
 from pipelines.preprocess.places import PlaceOptions, read_place
+from pipelines.rendering.render import arrange_contact_sheet, encode_png, render_3d
 from pipelines.runtime import storage
 from pipelines.schema.attribution import find_attribution
+from pipelines.schema.file_names import make_file_name
 from pipelines.schema.run_guard import guard_run
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, find_unwritten
 
 EVERYWHERE = RegionConfig(half_plane=(1.0, 0.0, -1e6))
+WIDTH_PX, HEIGHT_PX, AZIMUTH_DEG, ELEVATION_DEG = 800, 600, 30.0, 50.0
 SOURCES = {True: "opendrive", False: "osm"}
 
 
@@ -53,14 +57,32 @@ def write_maps(config: Config, directory: str, resolution_m: float) -> SceneSubs
     return SceneSubset(directory, source)
 
 
+def write_pictures(output: str, run: str, selection: SceneSubset, request: InpaintRequest, spec: LayoutSpec) -> str:
+    """Draw each place before and after, write PNG files, and return their directory."""
+    directory = storage.join_uri(output, "pictures", run)
+    given = [shard.scenes([row])[0] for shard, rows in selection.shards() for row in rows]
+    for number, scene in enumerate(given):
+        notice = f" {scene.attribution.split(', ')[0]}" if scene.attribution else ""
+        made = [from_model_surface(one, scene.source, spec) for one in request.shard(number).scenes()]
+        pictures = [render_3d(one, WIDTH_PX, HEIGHT_PX, AZIMUTH_DEG, ELEVATION_DEG) for one in (scene, *made)]
+        captions = [f"map{notice}", *(f"furnished map{notice}" for _ in made)]
+        data = encode_png(arrange_contact_sheet(pictures, 2, captions))
+        path = storage.join_uri(directory, f"{make_file_name(scene.scene_id)}.png")
+        storage.write_whole(path, lambda stream, data=data: stream.write(data))
+    return directory
+
+
 def main(config: Config) -> None:
     check_furnish_place(config)
     model, output = find_pipeline_directory(config.model), resolve_path(config.output, "furnished")
     pipeline, way = load_pipeline(model), RePaintOptions()
     kind, grid = pipeline.dit.config.label, pipeline.spec.grid
-    block_m = grid.rows * grid.resolution_m
-    if config.size_m < block_m:
-        raise ValueError(f"--size-m is {config.size_m:g}, expected at least {block_m:g}, the size of a model's scene")
+    block_m, cell_m = (grid.rows * grid.resolution_m / n for n in (1, pipeline.latent_shape[-1]))
+    if config.size_m < block_m or config.size_m % cell_m:
+        raise ValueError(
+            f"--size-m is {config.size_m:g}, expected at least {block_m:g}, the size of a scene of the model, and a "
+            f"multiple of {cell_m:g}"
+        )
     request = InpaintRequest(
         model=model,
         output=output,
@@ -82,7 +104,9 @@ def main(config: Config) -> None:
         total = sum(len(rows) for _, rows in selection.shards())
         shown = bar.add_task("furnish", total=total)
         inpaint_scenes(request, selection, config.num_actors, total, lambda: bar.advance(shown))
+        pictures = write_pictures(output, config.run, selection, request, pipeline.spec)
     print(f"scenes, source {request.source}, and {config.run}.html in {output}")
-    print(f"GLB files in {storage.join_uri(output, 'glb', config.run)}; the scenes of the map in {maps}")
+    print(f"GLB files in {storage.join_uri(output, 'glb', config.run)}, pictures in {pictures}")
+    print(f"scenes of the map in {maps}")
     if notice := find_attribution(selection.shards()[0][0].source):
         print(f"licence of the data, which publications and exports must state: {notice}")

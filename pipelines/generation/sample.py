@@ -215,7 +215,7 @@ def to_model_surface(scene: Scene, spec: LayoutSpec) -> Scene:
     Returns:
         The same scene, or a scene whose ground is higher or lower by SLAB_OFFSET_M.
     """
-    return _raise_ground(scene, find_surface_offset(scene.source, spec))
+    return _raise_ground(scene, _find_surface_offset(scene.source, spec))
 
 
 def from_model_surface(scene: Scene, source: str, spec: LayoutSpec) -> Scene:
@@ -229,10 +229,10 @@ def from_model_surface(scene: Scene, source: str, spec: LayoutSpec) -> Scene:
     Returns:
         The scene.
     """
-    return _raise_ground(scene, -find_surface_offset(source, spec))
+    return _raise_ground(scene, -_find_surface_offset(source, spec))
 
 
-def find_surface_offset(source: str, spec: LayoutSpec) -> float:
+def _find_surface_offset(source: str, spec: LayoutSpec) -> float:
     """Return the height of the reference surface of the model above that of a source (m); 0 for generated scenes."""
     surface = SURFACE.get(source, spec.surface)
     return spec.slab_offset_m - (SLAB_OFFSET_M if surface == "top" else 0.0)

@@ -11,10 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 from helpers import kill_ray_workers, tiny_planner
+from osm_map import LATITUDE, LONGITUDE, make_town_street
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from models.scene import DENSITIES, Scene
+from models.scene import CATEGORY_INDEX, DENSITIES, Scene
 from pipelines.runtime import storage
 from pipelines.schema.tables import find_shards, read_scenes
 
@@ -410,6 +411,41 @@ def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):
     Path(find_shards(str(samples))[0].path("scenes")).touch()  # the file may have different scenes after this change
     with pytest.raises(ValueError, match="holds a run 'inpainted' with other scenes; choose another --run"):
         inpaint(config)
+
+
+def test_furnish_keeps_the_map_and_resumes(smoke, tmp_path):
+    from jobs.furnish_place import Config
+    from jobs.implementation.furnish_place import main
+    from pipelines.schema.attribution import ATTRIBUTIONS
+
+    config = Config(
+        model=str(smoke / "models/pritti-smoke"),
+        input=make_town_street().write(tmp_path / "map.osm"),
+        origin=(LATITUDE, LONGITUDE, LATITUDE, LONGITUDE + 0.001),
+        size_m=96.0,
+        label="low",
+        output=str(tmp_path / "out"),
+    )
+    main(config)
+    given, made = list(read_scenes(str(tmp_path / "out/maps/furnished"))), list(read_scenes(config.output))
+    assert len(given) == len(made) == 2
+    assert all(len(list((tmp_path / f"out/{kind}/furnished").iterdir())) == 2 for kind in ("glb", "pictures"))
+    big = CATEGORY_INDEX["construction_big"]
+    for before, after in zip(given, made, strict=True):
+        houses = [sorted(scene.center_m[scene.category == big].tolist()) for scene in (before, after)]
+        assert len(houses[0]) > 4 and houses[0] == houses[1]
+        road = [scene.occupied[scene.ground_classes.index("road")] for scene in (before, after)]
+        assert np.array_equal(*road) and road[0].any()
+        assert after.attribution == ATTRIBUTIONS["osm"] and after.source == "generated-furnished"
+    (glb,) = [path for path in (tmp_path / "out/glb/furnished").iterdir() if "0000000-0" in path.name]
+    assert "OpenStreetMap" in json.dumps(trimesh.load(glb).metadata) or b"OpenStreetMap" in glb.read_bytes()
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.parquet")}
+    main(config)
+    assert times == {path: path.stat().st_mtime_ns for path in times}
+    with pytest.raises(ValueError, match="holds a run 'furnished' with"):
+        main(replace(config, heading_deg=45.0))
+    with pytest.raises(ValueError, match="--size-m is 97, expected at least 64"):
+        main(replace(config, size_m=97.0))
 
 
 def test_run_guard_keeps_noise_scaling_of_guided_run(smoke, tmp_path):

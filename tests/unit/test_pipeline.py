@@ -10,12 +10,14 @@ import torch
 from diffusers import DPMSolverMultistepScheduler, UniPCMultistepScheduler
 from helpers import LATENT_SHAPE, QUICK, random_scene, scenes_equal, small_spec, tiny_pipeline
 
+from models.composition.extend import inpaint_blocks
 from models.composition.inpaint import (
     composite_scenes,
     find_region_cells,
     make_latent_mask,
     select_around_objects,
     select_half_plane,
+    select_kept_pixels,
     select_polygon,
 )
 from models.composition.seam_blending import blend_ground
@@ -34,7 +36,7 @@ from models.sampling.diffusion import (
 )
 from models.sampling.repaint import RePaintConfig, TrainedInpainting
 from models.sampling.schedulers import SAMPLERS, SchedulerConfig, list_schedule_options
-from models.scene import Grid
+from models.scene import CATEGORY_INDEX, Grid
 from models.training import make_diffusion_loss
 
 SPEC = small_spec()
@@ -400,6 +402,47 @@ def test_inpaint_rejects_objects_only_for_mixed_latent():
     mixed = PrITTIPipeline(lvae, DiT(channels=channels, size=size, width=32, depth=1, heads=2))
     with pytest.raises(ValueError, match="mixes ground and objects, so it cannot regenerate only objects"):
         mixed.inpaint([random_scene(0, grid=SPEC.grid)], [np.ones((32, 32), bool)], ["low"], "objects")
+
+
+def test_inpaint_generates_around_kept_objects(pipeline):
+    big, small = CATEGORY_INDEX["construction_big"], CATEGORY_INDEX["pole"]
+    given = random_scene(5, n=30, grid=SPEC.grid)
+    category = np.where(np.arange(30) < 4, big, np.where(np.arange(30) < 8, small, given.category))
+    given = replace(given, category=category.astype(given.category.dtype))
+    whole, keep = np.ones((32, 32), bool), ("construction_big",)
+    (free,) = pipeline.inpaint([given], [whole], ["low"], "objects", repaint=QUICK)
+    (made,) = pipeline.inpaint([given], [whole], ["low"], "objects", repaint=QUICK, keep=keep)
+    kept = given.select(given.category == big)
+    assert (free.category == big).any() and len(kept) >= 4
+    assert np.array_equal(made.center_m[made.category == big], kept.center_m)
+    pixels = select_kept_pixels(given, keep, 4)
+    others = made.select(made.category != big)
+    assert len(others) and not pixels[SPEC.grid.pixel(others.center_m[:, 0], others.center_m[:, 1])].any()
+    assert pixels[SPEC.grid.pixel(kept.center_m[:, 0], kept.center_m[:, 1])].all()
+    *_, last = inpaint_blocks(pipeline, given, whole, "low", "objects", repaint=QUICK, keep=keep)
+    assert scenes_equal(last.canvases[0], made)
+    with pytest.raises(ValueError, match="category 'tree', expected some of: "):
+        pipeline.inpaint([given], [whole], ["low"], "objects", repaint=QUICK, keep=("tree",))
+
+
+def test_kept_pixels_are_footprints_and_cells_of_centers():
+    scene = random_scene(0, n=2, grid=SPEC.grid)  # Pixels of 2 m, cells of 4 pixels.
+    scene = replace(
+        scene,
+        category=np.array([CATEGORY_INDEX["construction_big"], CATEGORY_INDEX["pole"]], scene.category.dtype),
+        center_m=np.array([[16.0, 0.0, 2.0], [50.5, 20.5, 2.0]], np.float32),
+        rotation=np.tile(np.eye(3, dtype=np.float32), (2, 1, 1)),
+        size_m=np.array([[24.0, 12.0, 4.0], [0.2, 0.2, 4.0]], np.float32),
+    )
+    pixels = select_kept_pixels(scene, ("construction_big", "pole"), 4)
+    x_m, y_m = SPEC.grid.x_m()[:, None], SPEC.grid.y_m()[None, :]
+    footprint = (np.abs(x_m - 16) < 12) & (np.abs(y_m) < 6)
+    of_center = (np.abs(x_m - 12) < 4) & (np.abs(y_m + 4) < 4) | (np.abs(x_m - 20) < 4) & (np.abs(y_m + 4) < 4)
+    of_pole = (np.abs(x_m - 52) < 4) & (np.abs(y_m - 20) < 4)
+    assert (pixels[footprint | of_pole]).all() and not (pixels & ~(footprint | of_center | of_pole)).any()
+    mask = make_latent_mask([np.ones((32, 32), bool)], (6, 8, 8), "both", [footprint | of_pole])
+    known = mask[0] == 0  # Cells of 8 m that lie inside of the footprint, and that of the pole.
+    assert not known[:3].any() and known[3:].sum() == 3 * (np.sum(footprint.reshape(8, 4, 8, 4).all(axis=(1, 3))) + 1)
 
 
 def test_composite_of_empty_region_keeps_scene():
