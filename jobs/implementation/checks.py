@@ -17,6 +17,7 @@ from jobs.outpaint_scenes import Config as OutpaintConfig
 from jobs.preprocess_scenes import Av2, Kitti360, OpenDrive, Osm, Own, Town
 from jobs.publish_model import Config as PublishConfig
 from jobs.sample_scenes import Config as SampleConfig
+from jobs.simulate_traffic import Config as TrafficConfig
 from jobs.support.cli import home_path, make_absolute, require_positive, resolve_path
 from jobs.support.model_directories import find_pipeline_directory, require_model_labels
 from jobs.train_dit import Config as DiTConfig
@@ -28,6 +29,7 @@ from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 
 MAX_PLACE_M = 1024.0
+MAX_TRAFFIC_S, MAX_VEHICLES_PER_MIN = 3600.0, 600.0
 DENSITY_GROUPS = {"vegetation": VEGETATION, "vehicle": VEHICLES}  # Categories that each density label counts.
 
 
@@ -183,6 +185,19 @@ def require_categories(name: str, categories: Sequence[str]) -> None:
 def check_sample_scenes(config: SampleConfig) -> None:
     require_positive(config, "num_scenes", "num_inference_steps", "num_actors", "batch_size", "decode_batch_size")
     require_model_labels(find_pipeline_directory(config.model), config.labels)
+
+
+def check_simulate_traffic(config: TrafficConfig) -> None:
+    require_positive(config, "duration_s", "vehicles_per_min")
+    if config.pedestrians_per_min < 0 or config.num_examples < 0:
+        raise ValueError("--pedestrians-per-min and --num-examples are 0 or more")
+    if config.time_step_s < 0.25 or config.time_step_s % 0.25:
+        raise ValueError(f"--time-step-s is {config.time_step_s:g}, expected a multiple of 0.25")
+    if config.duration_s > MAX_TRAFFIC_S or config.vehicles_per_min > MAX_VEHICLES_PER_MIN:
+        raise ValueError(
+            f"--duration-s is {config.duration_s:g} and --vehicles-per-min is {config.vehicles_per_min:g}, expected at"
+            f" most {MAX_TRAFFIC_S:g} and {MAX_VEHICLES_PER_MIN:g}"
+        )
 
 
 def check_publish_model(config: PublishConfig) -> None:

@@ -40,7 +40,6 @@ from pipelines.evaluation.cities import (
 )
 from pipelines.evaluation.evaluate import compare_datasets
 from pipelines.evaluation.features import FeatureConfig, compute_scene_features, count_scenes
-from pipelines.evaluation.traffic import find_sumo
 from pipelines.metrics.controls import CONTROLS
 from pipelines.reporting.city_report import build_ring_table, render_city_html
 from pipelines.reporting.report import Picture
@@ -48,6 +47,7 @@ from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, find_shards
+from pipelines.traffic.sumo import find_sumo
 
 GENERATED, CONTROL = "generated", "control"
 DAMAGE = "moved"  # Damage of the default control.

@@ -1,25 +1,18 @@
 """Simulate traffic on the streets of a scene with SUMO, to find out whether vehicles can drive through it.
 
-The scene is exported as OpenDRIVE, which SUMO's netconvert reads. Trips start and end on random streets. SUMO is not a
-dependency; the Python package `eclipse-sumo` (extra `traffic`) or an installation with $SUMO_HOME provides it.
+The scene is exported as OpenDRIVE, which SUMO's netconvert reads. Trips start and end on random streets.
 """
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from defusedxml import ElementTree
-
 from models.scene import Scene
 from pipelines.io.opendrive import export_opendrive
+from pipelines.traffic.sumo import read_xml, require_sumo, run_program
 
-TIMEOUT_S = 600
 DEPARTURE_S = 1.0  # Time between two departures.
 HORIZON_S = 900.0  # End of the simulation.
 
@@ -43,14 +36,6 @@ class Traffic(NamedTuple):
         return self.arrived / self.routed if self.routed else float("nan")
 
 
-def find_sumo() -> Path | None:
-    """Return the home directory of SUMO: $SUMO_HOME or that of the package `eclipse-sumo`; None if there is none."""
-    home = os.environ.get("SUMO_HOME", "")
-    if not home and (spec := importlib.util.find_spec("sumo")) and spec.submodule_search_locations:
-        home = spec.submodule_search_locations[0]
-    return Path(home) if home and (Path(home) / "bin").is_dir() else None
-
-
 def simulate_traffic(scene: Scene, num_vehicles: int = 300, seed: int = 0) -> Traffic:
     """Let vehicles drive on the streets of a scene.
 
@@ -69,40 +54,20 @@ def simulate_traffic(scene: Scene, num_vehicles: int = 300, seed: int = 0) -> Tr
         RuntimeError: SUMO is not installed, or one of its programs fails.
         ValueError: The scene has no road.
     """
-    home = find_sumo()
-    if home is None:
-        raise RuntimeError(
-            "SUMO is not installed; install the extra traffic (pip install eclipse-sumo) or set SUMO_HOME"
-        )
+    home = require_sumo()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "scene.xodr").write_bytes(export_opendrive(scene))
-        _run(home, "bin/netconvert", "--opendrive", folder / "scene.xodr", "--output-file", folder / "net.xml")
+        run_program(home, "bin/netconvert", "--opendrive", folder / "scene.xodr", "--output-file", folder / "net.xml")
         trips = ("--net-file", folder / "net.xml", "--output-trip-file", folder / "trips.xml")
         times = ("--end", num_vehicles * DEPARTURE_S, "--period", DEPARTURE_S, "--seed", seed)
         routes = folder / "routes.xml"
-        _run(home, "tools/randomTrips.py", *trips, *times, "--route-file", routes, "--validate")
+        run_program(home, "tools/randomTrips.py", *trips, *times, "--route-file", routes, "--validate")
         options = ("--end", HORIZON_S, "--time-to-teleport", -1, "--seed", seed, "--no-step-log")
         files = ("--net-file", folder / "net.xml", "--route-files", routes)
-        _run(home, "bin/sumo", *files, *options, "--statistic-output", folder / "statistics.xml")
-        counts = ElementTree.parse(folder / "statistics.xml").find("vehicles")
+        run_program(home, "bin/sumo", *files, *options, "--statistic-output", folder / "statistics.xml")
+        counts = read_xml(folder / "statistics.xml").find("vehicles")
         if counts is None:
             raise RuntimeError(f"scene {scene.scene_id}: SUMO wrote no statistics of vehicles")
         loaded, running, waiting = (int(counts.get(key, "0")) for key in ("loaded", "running", "waiting"))
     return Traffic(num_vehicles, loaded, loaded - running - waiting)
-
-
-def _run(home: Path, program: str, *arguments: object) -> None:
-    """Run a program of SUMO; raise RuntimeError with the end of its output if it fails."""
-    command = [str(home / program), *map(str, arguments)]
-    if program.endswith(".py"):
-        command.insert(0, sys.executable)
-    variables = os.environ | {"SUMO_HOME": str(home), "PYTHONPATH": str(home / "tools")}
-    try:
-        done = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=TIMEOUT_S)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise RuntimeError(f"{command[0]}: {error}") from error
-    if done.returncode:
-        raise RuntimeError(
-            f"{program} of SUMO failed with code {done.returncode}: {(done.stderr or done.stdout)[-600:]}"
-        )

@@ -135,17 +135,18 @@ def encode_depth(view: StreetView) -> np.ndarray:
     return np.where(depth < 2**16, depth, 0).astype(np.uint16)
 
 
-def encode_animation(frames: list[np.ndarray]) -> bytes:
+def encode_animation(frames: list[np.ndarray], frames_per_second: float = FRAMES_PER_SECOND) -> bytes:
     """Encode frames as an animated WebP file, which web browsers display.
 
     Args:
         frames: Images (H, W, 3) uint8 of the same size.
+        frames_per_second: Speed.
 
     Returns:
         Content of the file.
     """
     content, (first, *rest) = io.BytesIO(), [Image.fromarray(frame) for frame in frames]
-    pause_ms = 1000 // FRAMES_PER_SECOND
+    pause_ms = int(1000 / frames_per_second)
     first.save(content, "WEBP", save_all=True, append_images=rest, duration=pause_ms, loop=0, quality=80)
     return content.getvalue()
 

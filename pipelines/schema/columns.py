@@ -14,6 +14,7 @@ from models.scene import CATEGORIES, GROUND_CLASSES
 from pipelines.runtime import storage
 
 TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
+TRAFFIC_TABLES = ("tracks", "traffic")  # Tables of jobs/simulate_traffic.py.
 SCENE_TABLES = ("scenes", "primitives", "rasters")  # Tables that every shard has.
 TEXTS = ("scene_id", "category", "label", "kind")  # Text columns of the table `primitives`.
 SCHEMA_VERSION = "1"  # Version of the column names and types. Descriptions may change within a version.
@@ -190,6 +191,53 @@ EDITS = _make_schema(
     ("moved_m",    pa.float32(), "m",   "Displacement of the centre; for a copy, the distance from its original."),
     ("turned_rad", pa.float32(), "rad", "Largest angle by which an axis turned; opposite directions count as equal."),
     ("resized",    pa.float32(), "1",   "Largest relative change of length, width or height."),
+)
+
+
+TRACKS = _make_schema(
+    "One row per road user and time of simulated traffic (jobs/simulate_traffic.py), ordered by scene, road user and "
+    "time. " + _FRAME,
+    _SCENE_ID,
+    ("object_id", pa.int32(),   "1",   "Number of the road user in the simulation of the scene, by time of departure."),
+    ("category",  pa.string(),  "",    "vehicle_small, vehicle_big, two_wheelers or human."),
+    ("time_s",    pa.float32(), "s",   "Time since the start of the simulation."),
+    ("x_m",       pa.float32(), "m",   "x of the centre in the scene frame."),
+    ("y_m",       pa.float32(), "m",   "y of the centre in the scene frame."),
+    ("z_m",       pa.float32(), "m",   "z of the centre in the scene frame."),
+    ("yaw_rad",   pa.float32(), "rad", "Direction of travel in the scene frame, in [-pi, pi)."),
+    ("speed_mps", pa.float32(), "m/s", "Speed."),
+    ("length_m",  pa.float32(), "m",   "Length of the road user."),
+    ("width_m",   pa.float32(), "m",   "Width of the road user."),
+    ("height_m",  pa.float32(), "m",   "Height of the road user."),
+)
+
+TRAFFIC = _make_schema(
+    "One row per scene, and one per damaged copy of a scene: what happened to the simulated vehicles.",
+    _SCENE_ID,
+    ("control",   pa.bool_(),   "",
+     "true for the copy of the scene with closed roads, which has no rows in tracks; false for the scene."),
+    ("failure",   pa.string(),  "",
+     "Reason why there is no simulation, such as a scene without roads; the other columns are then null."),
+    ("roads",             pa.int32(), "1", "Number of edges of the network: directions of roads between junctions."),
+    ("one_way_roads",     pa.int32(), "1",
+     "Number of roads that are too narrow for two directions between parked vehicles; they have one direction."),
+    ("unreachable_roads", pa.int32(), "1",
+     "Number of edges on which no vehicle can drive from one border of the scene to another."),
+    ("network_warnings",  pa.int32(), "1", "Number of warnings of SUMO's netconvert."),
+    ("requested",         pa.int32(), "1", "Number of random pairs of a road that enters and a road that leaves."),
+    ("routed",            pa.int32(), "1", "Number of these pairs with a route; each is a vehicle."),
+    ("inserted",          pa.int32(), "1", "Number of vehicles in the simulation, with those that start inside."),
+    ("arrived",           pa.int32(), "1", "Number of inserted vehicles that left the scene, without teleports."),
+    ("teleports",         pa.int32(), "1", "Number of times that SUMO moved a vehicle out of a jam."),
+    ("collisions",        pa.int32(), "1", "Number of collisions between vehicles."),
+    ("pedestrian_collisions", pa.int32(), "1", "Number of collisions of vehicles and pedestrians."),
+    ("parked",            pa.int32(), "1", "Number of parked vehicles, which are obstacles."),
+    ("parked_contacts",   pa.int32(), "1", "Number of vehicles that overlapped a parked vehicle by more than 0.1 m."),
+    ("fixed_contacts",    pa.int32(), "1",
+     "Number of vehicles that overlapped a building, wall, pole or object by more than 0.1 m."),
+    ("pedestrians",       pa.int32(), "1", "Number of pedestrians in the simulation."),
+    ("mean_distance_m",   pa.float64(), "m",   "Mean length of the ways of arrived vehicles."),
+    ("mean_speed_mps",    pa.float64(), "m/s", "Mean speed of arrived vehicles."),
 )
 
 

@@ -18,7 +18,17 @@ from models.limits import LimitError
 from models.scene import Scene
 from models.uris import split_options
 from pipelines.runtime import storage
-from pipelines.schema.columns import EDITS, PRIMITIVES, RASTERS, REJECTS, SCENE_TABLES, SCENES, TEXTS
+from pipelines.schema.columns import (
+    EDITS,
+    PRIMITIVES,
+    RASTERS,
+    REJECTS,
+    SCENE_TABLES,
+    SCENES,
+    TEXTS,
+    TRACKS,
+    TRAFFIC,
+)
 from pipelines.schema.conversion import make_scene_tables, parse_scenes
 from pipelines.schema.validation import validate_shard, validate_table
 
@@ -86,6 +96,8 @@ class Shard:
             "rasters": RASTERS,
             "edits": EDITS,
             "rejects": REJECTS,
+            "tracks": TRACKS,
+            "traffic": TRAFFIC,
         }.get(table)
         content = storage.read_parquet(self.path(table), columns, schema, encoded)
         with self._naming(table):

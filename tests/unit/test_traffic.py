@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from pipelines.evaluation import traffic
-from pipelines.evaluation.traffic import find_sumo, simulate_traffic
+from pipelines.evaluation.traffic import simulate_traffic
 from pipelines.preprocess.sources.town.version2.town import make_large_scene
+from pipelines.traffic.sumo import find_sumo
 
 needs_sumo = pytest.mark.skipif(find_sumo() is None, reason="needs SUMO (extra traffic)")
 

@@ -1,0 +1,1 @@
+"""Simulate traffic on the streets of scenes with SUMO."""
