@@ -53,7 +53,9 @@ edit_scenes remove --category pole --input @/town --output @/edited
 evaluate_scenes --real @/datasets/town --generated @/town --run town --lvae @/models/small-lvae --lite0 False
 evaluate_seams --generated @/outpainted
 evaluate_city --generated @/outpainted --real @/datasets/town --label any-any --num-towns 2
-export_scenes --input @/town --max-scenes 4 --formats glb npz --output @/exports
+export_scenes --input @/town --max-scenes 4 --formats glb npz xodr --output @/exports
+furnish_place --model town --input @/exports/xodr/generated-town-0-0000001.xodr --size-m 64 --output @/furnished
+simulate_traffic --input @/outpainted --duration-s 30 --num-examples 1
 import_scenes @/exports/glb --name theirs --output @/imported
 evaluate_voxels --ground-truth @/exports/npz --reconstructed @/exports/npz --output @/voxels
 render_streets --input @/town --max-scenes 2 --spacing-m 16 --width-px 176 --height-px 48 --output @/town

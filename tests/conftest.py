@@ -45,6 +45,7 @@ from helpers import (
     SHARD_SIZES,
     TOWN_SLOTS,
     fit_here,
+    make_straight_drive,
     random_scene,
     small_spec,
     studio_scene,
@@ -58,6 +59,7 @@ from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.runtime import storage
 from pipelines.schema.conversion import make_rejects_table
 from pipelines.schema.tables import Shard
+from pipelines.traffic.dataset import make_tracks_table
 
 MARKERS = {
     "unit": (),
@@ -356,7 +358,9 @@ def controlnet_weights(tmp_path_factory) -> tuple[str, str]:
 def studio_files(tmp_path_factory) -> Path:
     """Folder with three scenes in `tables` and a pipeline with random weights in `model`."""
     root = tmp_path_factory.mktemp("studio")
-    Shard(str(root / "tables"), "town", "test", 0).write([studio_scene(k) for k in range(3)])
+    shard = Shard(str(root / "tables"), "town", "test", 0)
+    shard.write([studio_scene(k) for k in range(3)])
+    storage.write_parquet(make_tracks_table("given-0", make_straight_drive()), shard.path("tracks"))
     tiny_pipeline(small_spec()).save_pretrained(root / "model")
     return root
 

@@ -30,6 +30,7 @@ from models.scene import (
 )
 from models.street_planner import StreetPlanner
 from pipelines.schema.palette import CLASS_ID, EMPTY
+from pipelines.traffic.tracks import Tracks
 
 ROOT = Path(__file__).parents[1]  # folder of the repository
 LATENT_SHAPE = (4, 8, 8)
@@ -269,3 +270,11 @@ def studio_scene(number: int) -> Scene:
         "category": np.full(3, CATEGORY_INDEX["vehicle_small"], np.int8),
     }
     return replace(scene, scene_id=f"given-{number}", occupied=occupied, label=UNSET, **boxes)
+
+
+def make_straight_drive(y_m: float = 0.0, kind: str = "car", speed_mps: float = 10.0) -> Tracks:
+    """Return a road user that moves along x for 5.5 s."""
+    time = np.arange(0, 6.0, 0.5)
+    center = np.stack([2 + speed_mps * time, np.full_like(time, y_m), np.full_like(time, 0.75)], axis=1)
+    numbers, kinds = np.zeros(len(time), np.int64), np.full(len(time), kind)
+    return Tracks(numbers, kinds, time, center, np.zeros_like(time), np.full_like(time, speed_mps))

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from PIL import Image
 from scipy import ndimage
 
@@ -52,6 +53,29 @@ def export_web_overview(scene: Scene, picture: np.ndarray) -> dict:
     """
     of_ground = _export_heights(scene, OVERVIEW_NODES) | {"picture": _encode_png(Image.fromarray(picture).quantize())}
     return {"scene_id": scene.scene_id, "grid": asdict(scene.grid), "ground": of_ground, "primitives": []}
+
+
+def export_web_tracks(tracks: pa.Table) -> list[dict]:
+    """Convert simulated traffic to JSON for the viewer.
+
+    Args:
+        tracks: Rows of the table tracks of one scene.
+
+    Returns:
+        One dictionary per road user, with the keys category, color, size_m, time_s (of each place) and places: x, y and
+        z of the centre (m) and yaw (radians).
+    """
+    rows = np.stack([tracks[name].to_numpy() for name in ("x_m", "y_m", "z_m", "yaw_rad")], axis=1)
+    size_m = np.stack([tracks[name].to_numpy() for name in ("length_m", "width_m", "height_m")], axis=1)
+    time_s, number, names = tracks["time_s"].to_numpy(), tracks["object_id"].to_numpy(), tracks["category"].to_pylist()
+    found = []
+    for part in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(number)) + 1):
+        if len(part):
+            about = {"category": names[part[0]], "color": COLOR_HEX[names[part[0]]]}
+            sizes = np.round(size_m[part[0]].astype(float), 3).tolist()
+            places = np.round(rows[part].astype(float), 3).tolist()
+            found.append(about | {"size_m": sizes, "time_s": time_s[part].astype(float).tolist(), "places": places})
+    return found
 
 
 def export_ground(scene: Scene) -> dict:

@@ -12,6 +12,7 @@ from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS
 from pipelines.traffic.obstacles import find_parked_vehicles, make_footprints
 
 SUPERSAMPLE = 2
+MOVING = (255, 220, 60)  # Colour of moving vehicles.
 
 
 def render_traffic(scene: Scene, tracks: pa.Table, size_px: int = 512, duration_s: float = 60.0) -> list[np.ndarray]:
@@ -44,7 +45,11 @@ def render_traffic(scene: Scene, tracks: pa.Table, size_px: int = 512, duration_
         for shape, category in zip(shapes, categories[now], strict=True):
             x_m, y_m = np.array(shape.exterior.coords).T
             corners = np.stack([(scene.grid.left_m - y_m) * scale, (scene.grid.front_m - x_m) * scale], axis=1)
-            color = tuple(int(v) for v in CLASS_COLORS[CATEGORY_IDS[CATEGORY_INDEX[category]]])
-            pen.polygon([(float(u), float(v)) for u, v in corners], fill=color, outline=(255, 255, 255))
+            color = (
+                MOVING
+                if category != "human"
+                else tuple(int(v) for v in CLASS_COLORS[CATEGORY_IDS[CATEGORY_INDEX[category]]])
+            )
+            pen.polygon([(float(u), float(v)) for u, v in corners], fill=color, outline=(30, 30, 30))
         frames.append(np.asarray(frame.resize((ground.width // SUPERSAMPLE, ground.height // SUPERSAMPLE))))
     return frames

@@ -140,7 +140,7 @@ def make_session_router(backend: Backend) -> APIRouter:
 
         router.post(f"/api/{operation}")(respond)
 
-    for operation in ("about", "state", "work"):
+    for operation in ("about", "state", "work", "tracks"):
         get(operation, f"/api/{operation}")
     for kind in DOWNLOADS:
         get(kind, f"/scene.{kind}")

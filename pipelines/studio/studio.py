@@ -8,21 +8,28 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import pyarrow as pa
 from pydantic import BaseModel
 
 from models.composition.extend import inpaint_blocks, split_region
 from models.composition.inpaint import select_polygon
 from models.labels import LABELS, require_labels
-from models.scene import Grid, Scene
+from models.scene import VEHICLES, Grid, Scene
 from pipelines.editing.edit import Duplicate, parse_edits, replay_edits, serialize_edits
-from pipelines.generation.sample import find_scene_label, load_pipeline, resample_to_model_resolution
+from pipelines.generation.sample import (
+    find_scene_label,
+    load_pipeline,
+    resample_to_model_resolution,
+    to_model_surface,
+)
 from pipelines.io.mesh_export import export_glb
 from pipelines.io.opendrive import export_opendrive
-from pipelines.io.web_export import export_ground, export_web_scene
+from pipelines.io.web_export import export_ground, export_web_scene, export_web_tracks
 from pipelines.rendering.render import render_bev
 from pipelines.reporting.report import encode_data_uri
 from pipelines.reporting.scene_index import Catalogue
+from pipelines.runtime import storage
 from pipelines.schema.conversion import parse_scenes
 from pipelines.schema.file_names import make_file_name
 from pipelines.schema.tables import Shard
@@ -38,6 +45,8 @@ from pipelines.studio.requests import (
 )
 from pipelines.studio.sessions import Session, SessionStore
 from pipelines.studio.tasks import BackgroundTask, TaskQueue
+from pipelines.traffic.dataset import read_tracks_of_scene
+from pipelines.traffic.obstacles import find_parked_vehicles
 
 MAX_SIDE_M = 512.0  # Maximum side length of an extended scene (m).
 THUMBNAIL_PX, SCENES_PER_PAGE = 128, 24
@@ -114,8 +123,8 @@ class Studio:
         """Carry out one request of a visitor.
 
         Args:
-            operation: Name of the operation: about, scenes, state, work, cancel, open, edit, undo, redo, generate,
-                inpaint, extend, or one of DOWNLOADS.
+            operation: Name of the operation: about, scenes, state, work, tracks, cancel, open, edit, undo, redo,
+                generate, inpaint, extend, or one of DOWNLOADS.
             visitor: Id of the visitor.
             request: Values of the request, for the operations that have values.
 
@@ -141,6 +150,8 @@ class Studio:
             return make_json_answer(self.tasks.describe(session.task) if session.task else {})
         if operation in DOWNLOADS:
             return self.export(session, operation)
+        if operation == "tracks":
+            return make_json_answer(self.find_tracks(session))
         if operation == "cancel":
             if session.task:
                 self.tasks.cancel(session.task)
@@ -362,15 +373,40 @@ class Studio:
 
     def open_scene(self, session: Session, scene_id: str) -> None:
         """Open a scene of a dataset. Raises StudioError if there is no such scene or if its tables are damaged."""
-        place = next(((c, k) for _, c, k, row in self.listed if row["scene_id"] == scene_id), None)
+        place = self.find_scene(scene_id)
         if place is None:
             raise StudioError(f"no scene {scene_id!r} in the datasets")
         try:
-            scene = read_scene(*place)
+            scene = to_model_surface(read_scene(*place), self.pipeline.spec)
         except ValueError as error:
             logger.warning("studio: scene %r cannot be read: %s", scene_id, error)
             raise StudioError("the tables of this scene are damaged; the log of the studio names the file") from error
         session.put(f"open {scene_id}", self.require_size(scene), (), self.limits.session_bytes)
+
+    def find_tracks(self, session: Session) -> dict:
+        """Return the simulated traffic of the scene, and the indices of its vehicles that are in traffic.
+
+        There is no traffic if the scene comes from no dataset, or jobs/simulate_traffic.py has not simulated it.
+        """
+        scene = session.state.scene
+        place = None if scene is None else self.find_scene(scene.scene_id)
+        if scene is None or place is None:
+            return {"objects": [], "driving": []}
+        catalogue, index = place
+        shard = catalogue.shards[catalogue.shard[index]]
+        if not storage.exists(shard.path("tracks")):
+            return {"objects": [], "driving": []}
+        try:
+            tracks = read_tracks_of_scene(shard, scene.scene_id)
+        except ValueError as error:
+            logger.warning("studio: no traffic of scene %r: %s", scene.scene_id, error)
+            raise StudioError("the tracks of this scene are damaged; the log of the studio names the file") from error
+        driving = np.isin(scene.category, VEHICLES) & ~find_parked_vehicles(scene)
+        return {"objects": export_web_tracks(tracks), "driving": np.flatnonzero(driving).tolist()}
+
+    def find_scene(self, scene_id: str) -> tuple[Catalogue, int] | None:
+        """Return the catalogue and the index of a scene of the datasets; None if there is no such scene."""
+        return next(((c, k) for _, c, k, row in self.listed if row["scene_id"] == scene_id), None)
 
     def list_scenes(self, request: ListRequest) -> dict:
         """Return one page of the scenes whose id contains `text`: ids, labels and thumbnails."""

@@ -19,7 +19,7 @@ STEP_M = 0.1
 CLEARANCE_M = 0.4  # Wanted distance from obstacles.
 KERB_CLEARANCE_M = 0.1  # Wanted distance from the border of the road.
 LEAST_CLEARANCE_M = 0.15  # Least distance from obstacles, where there is room.
-SMOOTH_S = 0.6  # Standard deviation of the Gaussian that smooths displacements.
+SMOOTH_S = 0.35  # Standard deviation of the Gaussian of each round of smoothing.
 ROUNDS = 8  # Number of times that displacements are smoothed and limited to the room between obstacles.
 # Costs of a displacement: per metre, per metre of missing clearance to obstacles, and to the border of the road.
 COSTS = 1.0, 20.0, 4.0

@@ -34,6 +34,7 @@ async function show(state, keep = false) {
     choose(keep && chosen < scene.primitives.length ? chosen : -1);
     await drawMap();
   }
+  await loadTraffic();
   document.body.dataset.shown = scene ? `${scene.scene_id}/${scene.primitives.length}/${state.undo}` : "";
   if (state.work && !state.work.finished) watch();
 }
@@ -75,6 +76,43 @@ $("inpaint").onclick = () => act("/api/inpaint", { ...sampling(), polygon_m: reg
 for (const button of document.querySelectorAll("[data-side]")) button.onclick = () => act("/api/extend", { ...sampling(), side: button.dataset.side });
 $("undo").onclick = () => act("/api/undo", {});
 $("redo").onclick = () => act("/api/redo", {});
+
+// --------------------------------------------------------------------------------------------------------- traffic
+
+let traffic = { objects: [], driving: [] }, began = 0, playing = false, traced = "";
+const SPEED = 2, HIDDEN = [0.001, 0.001, 0.001];
+
+async function loadTraffic() {
+  if (scene?.scene_id !== traced) { traced = scene?.scene_id ?? ""; traffic = scene ? await ask("/api/tracks") : { objects: [], driving: [] }; }
+  playing = false;
+  $("play").hidden = !traffic.objects.length; $("play").textContent = "▶ Traffic";
+}
+
+// Returns the box of a road user at a time.
+function boxAt({ color, size_m, time_s, places }, time) {
+  const last = time_s.length - 1, there = time >= time_s[0] && time <= time_s[last];
+  let k = 0;
+  while (k < last - 1 && time_s[k + 1] <= time) k++;
+  const a = places[k], b = places[Math.min(k + 1, last)], share = last ? Math.min(1, Math.max(0, (time - time_s[k]) / (time_s[Math.min(k + 1, last)] - time_s[k] || 1))) : 0;
+  const turn = Math.atan2(Math.sin(b[3] - a[3]), Math.cos(b[3] - a[3])), yaw = a[3] + share * turn, [c, s] = [Math.cos(yaw), Math.sin(yaw)];
+  return { color, size_m: there ? size_m : HIDDEN, center_m: [0, 1, 2].map((i) => a[i] + share * (b[i] - a[i])), rotation: [c, -s, 0, s, c, 0, 0, 0, 1] };
+}
+
+function playFrame(now) {
+  if (!playing) return;
+  const end = Math.max(...traffic.objects.map((one) => one.time_s.at(-1))), time = (((now - began) / 1000) * SPEED) % end;
+  viewer.showMoving(traffic.objects.map((one) => boxAt(one, time)));
+  $("name").textContent = `${scene.scene_id} · ${time.toFixed(0)} of ${end.toFixed(0)} s`;
+  document.body.dataset.time = time.toFixed(2);
+  requestAnimationFrame(playFrame);
+}
+
+$("play").onclick = () => {
+  playing = !playing;
+  $("play").textContent = playing ? "■ Stop" : "▶ Traffic";
+  for (const index of traffic.driving) if (scene.primitives[index]) viewer.move(index, playing ? { ...scene.primitives[index], size_m: HIDDEN } : scene.primitives[index]);
+  if (playing) { began = performance.now(); requestAnimationFrame(playFrame); } else { viewer.showMoving(null); $("name").textContent = `${scene.scene_id} · ${scene.primitives.length} primitives`; }
+};
 
 // ----------------------------------------------------------------------------------------------------------- edits
 

@@ -88,6 +88,21 @@ export class Viewer {
     this.remove(this.parts.filter((part) => !made.includes(part)));
     this.focus = focus(grid);
     this.heights = scene.primitives.map((p) => p.center_m[2]);
+    this.moving = null;
+    this.draw();
+  }
+
+  // Show boxes that move: the first call adds them, further calls with as many boxes move them, null removes them.
+  showMoving(primitives) {
+    if (!primitives || this.moving?.count !== primitives.length) {
+      if (this.moving) this.remove([this.moving.part]);
+      this.moving = null;
+      if (primitives?.length) {
+        const part = instances(this.gl, 0, primitives.map((p, i) => i), primitives);
+        this.moving = { count: primitives.length, part: { kind: 0, draw: part.draw, free: part.free }, placeAll: part.placeAll };
+        this.parts = [...this.parts, this.moving.part];
+      }
+    } else this.moving?.placeAll(primitives);
     this.draw();
   }
 
@@ -277,6 +292,7 @@ function instances(gl, kind, numbers, primitives, coarse) {
     kind,
     mark(index) { numbers.forEach((number, k) => { paint[4 * k + 3] = number === index ? 2 : 1; }); write(painted, paint); },
     place(index, p) { const k = row.get(index); if (k !== undefined) { fill(k, p); placed.forEach((target, c) => write(target, data[c])); } },
+    placeAll(list) { list.forEach((p, k) => fill(k, p)); placed.forEach((target, c) => write(target, data[c])); },
     draw() { gl.bindVertexArray(vao); gl.drawArraysInstanced(gl.TRIANGLES, 0, shape.corners.length / 3, numbers.length); },
     free() { for (const one of [...buffers, ...placed, painted]) gl.deleteBuffer(one); gl.deleteVertexArray(vao); },
   };

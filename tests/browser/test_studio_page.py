@@ -23,6 +23,14 @@ def test_studio_page_edits_inpaints_undoes_and_downloads(studio_url, studio_file
     shown = np.asarray(Image.open(io.BytesIO(browser.find_element("id", "view").screenshot_as_png)).convert("RGB"))
     assert len(np.unique(shown.reshape(-1, 3), axis=0)) > 100
 
+    browser.wait_for("!document.getElementById('play').hidden")
+    frozen = browser.find_element("id", "view").screenshot_as_png
+    browser.find_element("id", "play").click()
+    browser.wait_for("Number(document.body.dataset.time) > 1 && Number(document.body.dataset.time) < 5")
+    assert browser.find_element("id", "view").screenshot_as_png != frozen
+    browser.find_element("id", "play").click()
+    browser.wait_for("document.getElementById('play').textContent.includes('Traffic')")
+
     view = browser.find_element("id", "view")
     picked = ""
     for y in range(-200, 250, 25):  # click until a car is selected

@@ -170,6 +170,15 @@ def test_request_beyond_budget_is_refused(client):
     assert answer.status_code == 400 and "has 10 edits, and the studio accepts 10" in answer.text
 
 
+def test_studio_returns_the_tracks_of_the_open_scene(studio, client):
+    assert client.get("/api/tracks").json() == {"objects": [], "driving": []}
+    client.post("/api/open", json={"scene_id": "given-1"}, headers=POST)
+    assert client.get("/api/tracks").json()["objects"] == []
+    client.post("/api/open", json={"scene_id": "given-0"}, headers=POST)
+    (one,) = client.get("/api/tracks").json()["objects"]
+    assert one["category"] == "vehicle_small" and one["places"][2] == [12.0, 0.0, 0.75, 0.0] and one["time_s"][2] == 1.0
+
+
 def test_damaged_shard_does_not_hide_other_scenes(studio_files, tmp_path):
     """One shard has an infinite pose, another one a damaged raster: the list shows the other scenes."""
     Shard(str(tmp_path), "town", "test", 0).write([studio_scene(0)])

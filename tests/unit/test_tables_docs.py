@@ -19,7 +19,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from helpers import ROOT, random_scene
+from helpers import ROOT, make_straight_drive, random_scene
 
 from models.layout import LayoutSpec
 from models.scene import CATEGORIES, UNSET, VEGETATION, VEHICLES, Grid, Scene, make_yaw_rotation
@@ -37,6 +37,8 @@ from pipelines.schema.columns import (
     RASTERS,
     REJECTS,
     SCENES,
+    TRACKS,
+    TRAFFIC,
     make_latents_schema,
     make_street_latents_schema,
     make_street_maps_schema,
@@ -44,6 +46,7 @@ from pipelines.schema.columns import (
 from pipelines.schema.conversion import make_rejects_table
 from pipelines.schema.density_labels import classify_density, compute_density_thresholds
 from pipelines.schema.tables import Shard, read_scenes
+from pipelines.traffic.dataset import make_tracks_table, make_traffic_row
 
 PAGE = ROOT / "docs/reference/tables.md"
 SCHEMAS = {
@@ -52,6 +55,8 @@ SCHEMAS = {
     "rasters": RASTERS,
     "rejects": REJECTS,
     "edits": EDITS,
+    "tracks": TRACKS,
+    "traffic": TRAFFIC,
     "latents": make_latents_schema((4, 8, 8)),
     "street_latents": make_street_latents_schema((2, 8, 8)),
     "street_maps": make_street_maps_schema((2, 64, 64)),
@@ -190,6 +195,9 @@ def root(town, generated_scenes, rejects, tmp_path_factory) -> Path:
     tensors = map(pa.FixedShapeTensorArray.from_numpy_ndarray, (grounds.astype(np.float16), cells.astype(np.uint8)))
     streets = pa.table([ids, *tensors], schema=SCHEMAS["street_latents"])
     storage.write_parquet(streets, shard.path("street_latents"))
+    storage.write_parquet(make_tracks_table(ids[0].as_py(), make_straight_drive()), shard.path("tracks"))
+    row = make_traffic_row(ids[0].as_py(), False, None, "the scene has no road")
+    storage.write_parquet(pa.Table.from_pylist([row], schema=TRAFFIC), shard.path("traffic"))
     write_street_maps([random_scene(0, grid=Grid(256.0, 128.0, 0.5, 512, 512))], shard)
     return path
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.evaluation import traffic
 from pipelines.evaluation.traffic import simulate_traffic
 from pipelines.preprocess.sources.town.version2.town import make_large_scene
+from pipelines.traffic import sumo
 from pipelines.traffic.sumo import find_sumo
 
 needs_sumo = pytest.mark.skipif(find_sumo() is None, reason="needs SUMO (extra traffic)")
@@ -36,6 +36,6 @@ def test_scene_without_road_is_refused(town):
 
 
 def test_missing_sumo_is_reported(town, monkeypatch):
-    monkeypatch.setattr(traffic, "find_sumo", lambda: None)
-    with pytest.raises(RuntimeError, match=r"install the extra traffic \(pip install eclipse-sumo\)"):
+    monkeypatch.setattr(sumo, "find_sumo", lambda: None)
+    with pytest.raises(RuntimeError, match=r"install the extra traffic \(pip install 'pritti-on-ray\[traffic\]'\)"):
         simulate_traffic(town)
