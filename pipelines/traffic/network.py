@@ -26,7 +26,7 @@ class Lane:
 
     Attributes:
         index: Index of the lane in its edge.
-        shape_m: (k, 3) points of the middle of the lane, in the direction of travel (m).
+        shape_m: (k, 2) points of the middle of the lane, in the direction of travel (m).
         length_m: Length (m).
         width_m: Width (m).
     """
@@ -102,7 +102,7 @@ class Network:
         best = None
         for edge, lanes in self.lanes.items():
             for lane in lanes:
-                start, step = lane.shape_m[:-1, :2], np.diff(lane.shape_m[:, :2], axis=0)
+                start, step = lane.shape_m[:-1], np.diff(lane.shape_m, axis=0)
                 length = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
                 along = (((xy_m - start) * step).sum(axis=1) / length).clip(0, length)
                 distance = np.linalg.norm(start + step * (along / length)[:, None] - xy_m, axis=1)
@@ -131,6 +131,7 @@ def build_network(scene: Scene, home: Path, folder: Path) -> Network:
     (folder / "scene.xodr").write_bytes(export_opendrive(scene))
     files = ("--opendrive", folder / "scene.xodr", "--output-file", folder / "net.xml", "--type-files", home / TYPES)
     options = ("--offset.disable-normalization", "--opendrive.import-all-lanes", "--walkingareas", "--crossings.guess")
+    options += ("--flatten",)  # netconvert gives the ends of edges the height of the junction's middle.
     messages = run_program(home, "bin/netconvert", *files, *options, TURN)
     warnings = messages.count("Warning:")
     network = read_network(folder / "net.xml", scene.grid, warnings)
@@ -167,8 +168,7 @@ def read_network(path: Path, grid: Grid, num_warnings: int = 0) -> Network:
             if lane.get("allow") == SIDEWALK:
                 sidewalks[name] = length
                 continue
-            points = [[float(v) for v in point.split(",")] for point in lane.get("shape", "").split()]
-            shape = np.array([[*point, 0.0][:3] for point in points])  # SUMO leaves out heights of 0.
+            shape = np.array([point.split(",")[:2] for point in lane.get("shape", "").split()], float)
             lanes.setdefault(name, []).append(Lane(int(read_float(lane, "index")), shape, length, width))
     graph = nx.DiGraph()
     graph.add_nodes_from(lanes)
@@ -185,5 +185,5 @@ def read_network(path: Path, grid: Grid, num_warnings: int = 0) -> Network:
 
 
 def _is_at_border(point_m: np.ndarray, grid: Grid) -> bool:
-    x_m, y_m = point_m[:2]
+    x_m, y_m = point_m
     return bool(min(grid.front_m - x_m, x_m - grid.back_m, grid.left_m - y_m, y_m - grid.right_m) < BORDER_M)

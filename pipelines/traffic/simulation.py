@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import tempfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from models.scene import CATEGORY_INDEX, VEHICLES, Scene
+from pipelines.geometry.masks import find_nearest_true
 from pipelines.traffic.demand import KINDS, Demand, Routes, make_routes
 from pipelines.traffic.lateral import swerve
 from pipelines.traffic.network import Network, build_network
@@ -94,8 +96,9 @@ def simulate_scene(scene: Scene, demand: Demand, seed: int, slab_offset_m: float
         routes = make_routes(network, scene, driving, demand, seed)
         (folder / "routes.xml").write_bytes(routes.content)
         run_sumo(home, network.path, folder, demand, seed)
-        tracks = read_tracks(folder / "fcd.xml", slab_offset_m)
+        tracks = read_tracks(folder / "fcd.xml")
         tracks = swerve(tracks, scene, parked | np.isin(scene.category, FIXED), demand.time_step_s)
+        tracks = put_on_ground(tracks, scene, slab_offset_m)
         health = measure_health(scene, network, routes, parked, tracks, folder)
     return tracks, health
 
@@ -128,36 +131,56 @@ def run_sumo(home: Path, network: Path, folder: Path, demand: Demand, seed: int)
     run_program(home, "bin/sumo", *files, *outputs, *times, *safety, *quiet, "--seed", seed)
 
 
-def read_tracks(path: Path, slab_offset_m: float) -> Tracks:
+def put_on_ground(tracks: Tracks, scene: Scene, slab_offset_m: float) -> Tracks:
+    """Set the heights of road users to those of the ground.
+
+    Args:
+        tracks: Trajectories.
+        scene: Scene.
+        slab_offset_m: Height of the ground raster above the surface on which objects stand (m).
+
+    Returns:
+        Trajectories.
+    """
+    height_m, classes = scene.surface()
+    known = classes >= 0
+    ground_m = height_m[find_nearest_true(known)] if known.any() else height_m
+    row = (scene.grid.front_m - tracks.center_m[:, 0]) / scene.grid.resolution_m - 0.5
+    col = (scene.grid.left_m - tracks.center_m[:, 1]) / scene.grid.resolution_m - 0.5
+    center_m = tracks.center_m.copy()
+    center_m[:, 2] = map_coordinates(ground_m.astype(float), [row, col], order=1, mode="nearest")
+    center_m[:, 2] += tracks.size_m[:, 2] / 2 - slab_offset_m
+    return replace(tracks, center_m=center_m)
+
+
+def read_tracks(path: Path) -> Tracks:
     """Read the trajectories that SUMO writes with --fcd-output.
 
     SUMO states the middle of the front of a vehicle, and the compass direction.
 
     Args:
         path: XML file.
-        slab_offset_m: Height of the network above the surface on which objects stand (m).
 
     Returns:
-        Trajectories, ordered by road user and time.
+        Trajectories, ordered by road user and time, at height 0.
     """
     rows, kinds = [], []
     for step in read_xml(path).iterfind("timestep"):
         time_s = read_float(step, "time")
         for user in step:
-            place = (read_float(user, key) for key in ("x", "y", "z", "angle", "speed"))
+            place = (read_float(user, key) for key in ("x", "y", "angle", "speed"))
             rows.append((read_float(user, "id"), time_s, *place))
             kinds.append(user.get("type") or "pedestrian")
-    table = np.array(rows, float).reshape(-1, 7)
+    table = np.array(rows, float).reshape(-1, 6)
     kind = np.array(kinds, dtype="<U16")
     order = np.lexsort([table[:, 1], table[:, 0]])
     table, kind = table[order], kind[order]
-    yaw = (np.pi / 2 - np.deg2rad(table[:, 5]) + np.pi) % (2 * np.pi) - np.pi
+    yaw = (np.pi / 2 - np.deg2rad(table[:, 4]) + np.pi) % (2 * np.pi) - np.pi
     size_m = np.array([KINDS[name].size_m for name in kind]).reshape(-1, 3)
-    center = table[:, 2:5].copy()
+    center = np.pad(table[:, 2:4], ((0, 0), (0, 1)))
     back_m = np.where(kind == "pedestrian", 0.0, size_m[:, 0] / 2)
     center[:, :2] -= back_m[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-    center[:, 2] += size_m[:, 2] / 2 - slab_offset_m
-    return Tracks(table[:, 0].astype(np.int64), kind, table[:, 1], center, yaw, table[:, 6])
+    return Tracks(table[:, 0].astype(np.int64), kind, table[:, 1], center, yaw, table[:, 5])
 
 
 def measure_health(

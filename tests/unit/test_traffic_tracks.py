@@ -34,7 +34,7 @@ from pipelines.traffic.obstacles import (
     select_footprints,
     select_road,
 )
-from pipelines.traffic.simulation import measure_health, read_tracks, simulate_scene
+from pipelines.traffic.simulation import measure_health, put_on_ground, read_tracks, simulate_scene
 from pipelines.traffic.sumo import find_sumo
 
 GRID = Grid(128.0, 64.0, 0.5, 256, 256)
@@ -91,7 +91,7 @@ def test_network_has_the_edges_and_links_of_the_file(recorded, network):
     assert set(network.sidewalks) == walked
     assert network.entries and network.exits and network.count_unreachable() == 0
     for edge in network.entries:  # A route of SUMO begins there.
-        x_m, y_m = network.lanes[edge][0].shape_m[0, :2]
+        x_m, y_m = network.lanes[edge][0].shape_m[0]
         assert min(GRID.front_m - x_m, x_m - GRID.back_m, GRID.left_m - y_m, y_m - GRID.right_m) < 5
     routes = ElementTree.parse(recorded / "routes.xml").getroot().iter("route")
     for route in (one.get("edges").split() for one in routes):
@@ -100,7 +100,7 @@ def test_network_has_the_edges_and_links_of_the_file(recorded, network):
 
 
 def test_tracks_are_centres_of_the_recorded_vehicles(recorded):
-    tracks = read_tracks(recorded / "fcd.xml", 0.3)
+    tracks = read_tracks(recorded / "fcd.xml")
     root = ElementTree.parse(recorded / "fcd.xml").getroot()
     rows = [(float(step.get("time")), user) for step in root.iter("timestep") for user in step]
     assert len(tracks) == len(rows) > 300
@@ -110,7 +110,6 @@ def test_tracks_are_centres_of_the_recorded_vehicles(recorded):
     ahead = np.array([np.cos(tracks.yaw_rad[k]), np.sin(tracks.yaw_rad[k])])
     assert np.allclose(tracks.center_m[k, :2] + 2.2 * ahead, front, atol=1e-6)
     assert np.tan(np.radians(90 - float(user.get("angle")))) == pytest.approx(ahead[1] / ahead[0], rel=1e-6)
-    assert tracks.center_m[k, 2] == pytest.approx(float(user.get("z")) + 0.75 - 0.3)
     for number in np.unique(tracks.object_id):  # The speed of SUMO is that of the positions.
         part = tracks.select((tracks.object_id == number) & tracks.is_vehicle)
         moved = np.linalg.norm(np.diff(part.center_m[:, :2], axis=0), axis=1)
@@ -122,7 +121,7 @@ def test_health_agrees_with_the_recorded_statistics(recorded, network, town):
     parked = find_parked_vehicles(town)
     driving = ~parked & np.isin(town.category, [2, 3])
     routes = make_routes(network, town, driving, Demand(duration_s=40.0, vehicles_per_min=12.0), 0)
-    tracks = read_tracks(recorded / "fcd.xml", 0.3)
+    tracks = read_tracks(recorded / "fcd.xml")
     health = measure_health(town, network, routes, parked, tracks, recorded)
     vehicles = ElementTree.parse(recorded / "statistics.xml").getroot().find("vehicles")
     trips = list(ElementTree.parse(recorded / "arrivals.xml").getroot().iter("tripinfo"))
@@ -150,11 +149,11 @@ def test_vehicles_in_traffic_start_at_their_places(network, town):
     shape = lanes[0].shape_m
     middle = len(shape) // 2
     yaw = np.arctan2(*(shape[middle + 1] - shape[middle])[1::-1])
-    found = network.find_lane(shape[middle, :2], float(yaw) + np.pi)  # Boxes have no front.
+    found = network.find_lane(shape[middle], float(yaw) + np.pi)  # Boxes have no front.
     assert found is not None and found[0] == edge
-    along = np.linalg.norm(np.diff(shape[: middle + 1, :2], axis=0), axis=1).sum()
+    along = np.linalg.norm(np.diff(shape[: middle + 1], axis=0), axis=1).sum()
     assert found[2] == pytest.approx(along, abs=0.01)
-    assert network.find_lane(shape[middle, :2], float(yaw) + np.pi / 2) is None
+    assert network.find_lane(shape[middle], float(yaw) + np.pi / 2) is None
 
 
 # ------------------------------------------------------------------------------------------------- obstacles
@@ -213,6 +212,16 @@ def test_vehicles_swerve_around_parked_ones():
     assert np.array_equal(swerve(walker, scene, parked, 0.5).center_m, walker.center_m)
 
 
+def test_road_users_stand_on_the_ground():
+    scene = make_street([])
+    slope = replace(scene, height_m=(scene.occupied * 0.05 * scene.grid.x_m()[:, None]).astype(np.float32))
+    tracks = make_straight_drive()
+    made = put_on_ground(tracks, slope, 0.3)
+    assert np.allclose(made.center_m[:, 2], 0.05 * tracks.center_m[:, 0] + 0.75 - 0.3, atol=0.02)
+    beside = put_on_ground(make_straight_drive(y_m=20.0), slope, 0.0)  # The nearest ground is that of the road.
+    assert np.allclose(beside.center_m[:, 2], 0.05 * tracks.center_m[:, 0] + 0.75, atol=0.02)
+
+
 def test_footprint_pixels_are_those_of_the_box():
     scene = make_street([(20, 3.0, 0.5)])
     pixels = select_footprints(scene, np.ones(1, bool))
@@ -227,7 +236,7 @@ def test_footprint_pixels_are_those_of_the_box():
 
 
 def test_tables_of_tracks_hold_all_positions(recorded, town):
-    tracks = read_tracks(recorded / "fcd.xml", 0.3)
+    tracks = read_tracks(recorded / "fcd.xml")
     table = make_tracks_table("one", tracks)
     assert table.schema == TRACKS and len(table) == len(tracks)
     assert set(table["category"].to_pylist()) <= {"vehicle_small", "vehicle_big", "two_wheelers", "human"}
