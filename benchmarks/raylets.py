@@ -171,6 +171,8 @@ class Cluster:
         command += [f"--object-store-memory={OBJECT_STORE_BYTES}"]
         # Submitted jobs need an agent. The agent of another cluster on this machine may have the usual port.
         command += [f"--dashboard-agent-listen-port={find_free_port()}"]
+        if number:  # Nodes of one directory would overwrite the code of submitted jobs.
+            command += ["--temp-dir", str(self.folder / f"n{number}")]
         if self.private and number:
             command = ["unshare", "-rm", "sh", "-c", MOUNT, str(self.private), *command]
         path = self.folder / f"node-{number}.log"
