@@ -5,6 +5,7 @@
     jobs/preprocess_scenes.py town --num-train 500 --num-test 100
     jobs/preprocess_scenes.py kitti360 --input KITTI-360 --output DIR
     jobs/preprocess_scenes.py av2 --input AV2 --output DIR
+    jobs/preprocess_scenes.py py123d --input PY123D_DATA_ROOT --output DIR     nuScenes, nuPlan, Waymo, PandaSet, ...
     jobs/preprocess_scenes.py osm --input city.osm.pbf --origin 52.474 13.440 --radius-m 500 --output DIR
     jobs/preprocess_scenes.py opendrive --input town.xodr --output DIR
     jobs/preprocess_scenes.py own --input DRIVES --output DIR             your own drives: docs/how_to/own_drives.md
@@ -77,6 +78,23 @@ class Av2:
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/av2)."""
     if_busy: IfBusyOption = "refuse"
     log_format: LogFormatOption = "text"
+    skip_unreadable: bool = False
+    """Skip logs with unreadable files and list them in rejects; without this option, the job stops."""
+
+
+@dataclass(frozen=True)
+class Py123d:
+    """Read logs that py123d converted from nuScenes, nuPlan, Waymo and others (docs/how_to/py123d.md)."""
+
+    input: str
+    """Directory into which py123d-conversion wrote: it contains logs/ and maps/ (PY123D_DATA_ROOT)."""
+    output: str = ""
+    """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/py123d)."""
+    if_busy: IfBusyOption = "refuse"
+    log_format: LogFormatOption = "text"
+    slots: Literal["p95", "p99.5", "paper"] = "p95"
+    """Rule for the number of slots per category: a percentile over the training split, or the paper's 514 slots in
+    total. Models do not learn objects beyond these slots."""
     skip_unreadable: bool = False
     """Skip logs with unreadable files and list them in rejects; without this option, the job stops."""
 
@@ -161,6 +179,7 @@ Config = (
     Annotated[Town, tyro.conf.subcommand("town")]
     | Annotated[Kitti360, tyro.conf.subcommand("kitti360")]
     | Annotated[Av2, tyro.conf.subcommand("av2")]
+    | Annotated[Py123d, tyro.conf.subcommand("py123d")]
     | Annotated[Osm, tyro.conf.subcommand("osm")]
     | Annotated[OpenDrive, tyro.conf.subcommand("opendrive")]
     | Annotated[Own, tyro.conf.subcommand("own")]

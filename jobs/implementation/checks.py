@@ -14,7 +14,7 @@ from jobs.furnish_place import Config as FurnishConfig
 from jobs.implementation.protocols import PROTOCOLS, apply_protocol
 from jobs.inpaint_scenes import Config as InpaintConfig
 from jobs.outpaint_scenes import Config as OutpaintConfig
-from jobs.preprocess_scenes import Av2, Kitti360, OpenDrive, Osm, Own, Town
+from jobs.preprocess_scenes import Av2, Kitti360, OpenDrive, Osm, Own, Py123d, Town
 from jobs.publish_model import Config as PublishConfig
 from jobs.sample_scenes import Config as SampleConfig
 from jobs.simulate_traffic import Config as TrafficConfig
@@ -136,7 +136,7 @@ def check_encode_latents(config: EncodeConfig) -> None:
     Dataset.open(resolve_path(config.dataset, "datasets", "town"))
 
 
-def check_preprocess_scenes(config: Town | Kitti360 | Av2 | Osm | OpenDrive | Own) -> None:
+def check_preprocess_scenes(config: Town | Kitti360 | Av2 | Py123d | Osm | OpenDrive | Own) -> None:
     if isinstance(config, Town) and config.free_pose_share is not None:
         if not 0 <= config.free_pose_share <= 1:
             raise ValueError(f"--free-pose-share is {config.free_pose_share}, expected a share between 0 and 1")

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from jobs.implementation.checks import check_preprocess_scenes
-from jobs.preprocess_scenes import Av2, Kitti360, OpenDrive, Osm, Own, Town
+from jobs.preprocess_scenes import Av2, Kitti360, OpenDrive, Osm, Own, Py123d, Town
 from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
@@ -31,7 +31,7 @@ def find_free_pose_share(config: Town) -> float:
     return default if config.free_pose_share is None else config.free_pose_share
 
 
-Config = Town | Kitti360 | Av2 | Osm | OpenDrive | Own
+Config = Town | Kitti360 | Av2 | Py123d | Osm | OpenDrive | Own
 
 
 def make_osm_options(config: Osm) -> OsmOptions:
@@ -66,8 +66,8 @@ def plan_shards(config: Config) -> list:
             inputs, OpenDriveOptions(config.spacing_m, find_unmapped_ground(config)), config.test_share
         )
     root = make_absolute(config.input)
-    if isinstance(config, Av2):
-        return sharding.plan_argoverse2(root)
+    if isinstance(config, Av2 | Py123d):
+        return (sharding.plan_argoverse2 if isinstance(config, Av2) else sharding.plan_py123d)(root)
     plan_drives = sharding.plan_kitti360 if isinstance(config, Kitti360) else sharding.plan_custom
     return plan_drives(root, config.make_split, config.skip_unreadable)
 

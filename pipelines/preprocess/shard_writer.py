@@ -18,7 +18,7 @@ import pyarrow as pa
 from models.geometry.cholesky import compute_cholesky_parameters
 from models.scene import Grid, Scene
 from pipelines.preprocess.sharding import ShardPart, ShardTask
-from pipelines.preprocess.sources import argoverse2, custom, kitti360
+from pipelines.preprocess.sources import argoverse2, custom, kitti360, py123d
 from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.opendrive import reader as opendrive
 from pipelines.preprocess.sources.osm import reader as osm
@@ -38,7 +38,7 @@ def read_drive(source: str, key: tuple) -> tuple[Drive, dict]:
     """Read a drive, and report the objects that the reader dropped.
 
     Args:
-        source: town, kitti360, av2, osm, opendrive or own.
+        source: town, kitti360, av2, py123d, osm, opendrive or own.
         key: Arguments for the reader of this source.
 
     Returns:
@@ -51,6 +51,9 @@ def read_drive(source: str, key: tuple) -> tuple[Drive, dict]:
         seed, num_scenes, version, num_free = key
         drive = generator.generate_town(seed, version, num_free)
         return drive.at(generator.select_town_poses(len(drive), num_scenes, num_free)), {}
+    if source == py123d.SOURCE:
+        drive, skipped = py123d.read_drive(*key)
+        return drive, {"boxes_without_category": skipped}
     if source in (osm.SOURCE, opendrive.SOURCE):
         return (osm if source == osm.SOURCE else opendrive).read_drive(*key)
     if source == "kitti360":

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.preprocess.sources import argoverse2, custom, kitti360
+from pipelines.preprocess.sources import argoverse2, custom, kitti360, py123d
 from pipelines.preprocess.sources.maps import list_map_files
 from pipelines.preprocess.sources.opendrive import file
 from pipelines.preprocess.sources.opendrive import reader as opendrive
@@ -216,6 +217,34 @@ def plan_argoverse2(root: str) -> list[ShardTask]:
                 (side, tuple(ShardPart((root, theirs, log), log) for log in logs[start : start + LOGS_PER_SHARD]))
             )
     return _number_tasks("av2", plan)
+
+
+def plan_py123d(root: str) -> list[ShardTask]:
+    """Plan tasks of LOGS_PER_SHARD logs each.
+
+    Logs of splits that end with "train" get the split train, and the others the split test. If there are only others,
+    they get the split train.
+
+    Args:
+        root: Directory into which py123d-conversion wrote.
+
+    Returns:
+        The tasks.
+
+    Raises:
+        ValueError: The directory holds no log, or two logs have the same name.
+    """
+    logs = py123d.list_logs(root)
+    if twice := [name for name, count in Counter(log for _, log in logs).items() if count > 1]:
+        raise ValueError(f"{root}: two splits hold a log {twice[0]}; move one of them out of logs/")
+    trains = {split for split, _ in logs if split.endswith(TRAIN)} or {split for split, _ in logs}
+    plan = []
+    for side in (TRAIN, TEST):
+        chosen = [one for one in logs if (one.split in trains) == (side == TRAIN)]
+        for start in range(0, len(chosen), LOGS_PER_SHARD):
+            parts = (ShardPart((root, *one), one.log) for one in chosen[start : start + LOGS_PER_SHARD])
+            plan.append((side, tuple(parts)))
+    return _number_tasks(py123d.SOURCE, plan)
 
 
 Poses = tuple[np.ndarray, np.ndarray]  # frame (p,) and world_from_imu (p, 3, 4)

@@ -22,7 +22,7 @@ DESCRIPTION = "dataset.json"
 Extremes = dict[str, list[list[float]]]  # Name -> [lowest, highest]; both are lists with one value per component.
 # Per source, the surface to which the ground heights refer. "surface" is the surface on which objects stand.
 # "top" is the top of the ground slabs, 0.3 m above that surface.
-SURFACE = {"town": "top", "kitti360": "top"} | dict.fromkeys(("av2", "osm", "opendrive", "own"), "surface")
+SURFACE = {"town": "top", "kitti360": "top"} | dict.fromkeys(("av2", "osm", "opendrive", "own", "py123d"), "surface")
 
 
 @dataclass(frozen=True)

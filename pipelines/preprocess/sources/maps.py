@@ -1,19 +1,34 @@
-"""Functions that the readers of maps share (OpenStreetMap and OpenDRIVE): input files and poses."""
+"""Functions that the readers of maps share: input files, poses, ground and licence notices."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.scene import KITTI_GROUND_CLASSES
-from pipelines.preprocess.sources.drive import LayeredGround
+from models.scene import KITTI_GROUND_CLASSES, Grid, Scene
+from pipelines.preprocess.sources.drive import Drive, LayeredGround
 from pipelines.preprocess.sources.input_paths import InputPath, make_input_path
 from pipelines.preprocess.sources.town.world import IMU_HEIGHT_M
 
 SQUARE_M = 256.0  # Side of the squares that order the poses.
+
+
+@dataclass(frozen=True, eq=False)
+class MapDrive(Drive):
+    """Drive whose scenes state a licence notice.
+
+    Attributes:
+        attribution: Notice, or None.
+    """
+
+    attribution: str | None = None
+
+    def scene(self, index: int, split: str = "unused", grid: Grid | None = None) -> Scene:
+        """Crop the Scene ahead of a pose; see `Drive.scene`."""
+        return replace(super().scene(index, split, grid), attribution=self.attribution)
 
 
 def list_map_files(inputs: Iterable[str], suffixes: tuple[str, ...], remedy: str) -> list[str]:

@@ -8,14 +8,14 @@ The world frame is the inertial frame of the file.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
 
-from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES, Grid, Scene, make_yaw_rotation
+from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES, make_yaw_rotation
 from pipelines.preprocess.sources.drive import HIDDEN, STATIC, Drive, LayeredGround
-from pipelines.preprocess.sources.maps import fill_ground, make_world_from_imu, order_by_squares
+from pipelines.preprocess.sources.maps import MapDrive, fill_ground, make_world_from_imu, order_by_squares
 from pipelines.preprocess.sources.opendrive.file import read_map
 from pipelines.preprocess.sources.opendrive.lanes import LAYERS, LanePoses, make_lane_poses, triangulate_lanes
 from pipelines.preprocess.sources.opendrive.objects import Box, MapObjects, make_objects
@@ -34,21 +34,6 @@ class OpenDriveOptions:
 
     spacing_m: float = 10.0
     unmapped_ground: str | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class MapDrive(Drive):
-    """Drive whose scenes carry the licence notice of a file.
-
-    Attributes:
-        attribution: Notice, or None.
-    """
-
-    attribution: str | None = None
-
-    def scene(self, index: int, split: str = "unused", grid: Grid | None = None) -> Scene:
-        """Crop the Scene ahead of a pose; see `Drive.scene`."""
-        return replace(super().scene(index, split, grid), attribution=self.attribution)
 
 
 def read_poses(path: str, options: OpenDriveOptions) -> tuple[str, LanePoses]:
