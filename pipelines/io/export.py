@@ -1,4 +1,4 @@
-"""Export scenes as GLB, PLY, voxels, OpenDRIVE or GeoJSON, with one Ray task per shard."""
+"""Export scenes as GLB, PLY, voxels, OpenDRIVE, GeoJSON or GeoParquet, with one Ray task per shard."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Literal
 
 from models.scene import Scene
 from pipelines.io.geojson import export_geojson
+from pipelines.io.geoparquet import export_geoparquet
 from pipelines.io.mesh_export import export_glb, export_ply
 from pipelines.io.opendrive import export_opendrive
 from pipelines.io.voxel_import import export_voxels_npz
@@ -17,7 +18,7 @@ from pipelines.schema.file_names import make_file_name
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 
-Format = Literal["glb", "ply", "npz", "xodr", "geojson"]
+Format = Literal["glb", "ply", "npz", "xodr", "geojson", "geoparquet"]
 NOTICE = "NOTICE.txt"  # Licence notices of all exported scenes.
 WRITERS: dict[str, Callable[[Scene], bytes]] = {
     "glb": export_glb,
@@ -25,6 +26,7 @@ WRITERS: dict[str, Callable[[Scene], bytes]] = {
     "npz": export_voxels_npz,
     "xodr": export_opendrive,
     "geojson": export_geojson,
+    "geoparquet": export_geoparquet,
 }
 
 
