@@ -23,7 +23,7 @@ from jobs.support.options import IfBusyOption, LogFormatOption, SceneOptions
 
 @dataclass(frozen=True)
 class Config(SceneOptions):
-    formats: tuple[Literal["glb", "ply", "npz", "xodr", "geojson", "geoparquet"], ...] = ("glb",)
+    formats: tuple[Literal["glb", "ply", "npz", "xodr", "geojson", "geoparquet", "usd"], ...] = ("glb",)
     """File formats to write."""
     output: str = ""
     """Directory to write to (default: export/ in the input directory)."""

@@ -6,11 +6,11 @@
     jobs/furnish_place.py --input berlin.osm.pbf --origin 52.4737 13.4399 52.4780 13.4292       two places
     jobs/furnish_place.py --input town.xodr --origin 120 -40 --keep-categories                  without its buildings
 
-The job reads a square of an extract of OpenStreetMap or of an OpenDRIVE file. It keeps the ground and the buildings,
-and generates parked vehicles, pedestrians, plants, poles, signs and other objects. It writes scene tables with
-source=generated-<run>, one GLB file per scene (<output>/glb/<run>), pictures of each place before and after
-(<output>/pictures/<run>), the scenes of the map (<output>/maps/<run>) and <run>.html, which shows both from above. Run
-the same command again to resume after an interruption.
+The job reads a square of an extract of OpenStreetMap or of an OpenDRIVE file. It keeps the ground, the buildings, and
+walls and fences (--keep-categories), and generates vehicles, pedestrians, plants, poles, signs and other objects. It
+writes scene tables with source=generated-<run>, one GLB file per scene (<output>/glb/<run>), pictures of each place
+before and after (<output>/pictures/<run>), the scenes of the map (<output>/maps/<run>) and <run>.html, which shows both
+from above. Run the same command again to resume after an interruption.
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ class Config:
     """Extract of OpenStreetMap (.osm, .osm.gz, .osm.bz2 or .osm.pbf), or an OpenDRIVE file (.xodr or .xodr.gz)."""
     origin: tuple[float, ...] = ()
     """Latitude and longitude of the middle of the place; x and y in metres for OpenDRIVE. Further pairs are further
-    places (default: the middle of the map)."""
+    places (default: the point on a street that is nearest to the mean of all streets)."""
     size_m: float = 192.0
-    """Side of the square in metres, at least that of a scene of the model. Each block of 64 m takes seconds."""
+    """Side of the square in metres: at least that of a scene of the model, at most 1024, and a multiple of a latent
+    cell. Each block of 64 m takes seconds."""
     heading_deg: float = 0.0
     """Direction of the x axis of the scene, in degrees clockwise from north."""
     drive_on: Literal["right", "left"] = "right"

@@ -40,8 +40,8 @@ class Config(RePaintOptions):
     contents: Literal["both", "ground", "objects"] = "both"
     """Content to regenerate in the region."""
     keep_categories: tuple[str, ...] = ()
-    """Categories whose objects are kept in the region, such as construction_big for buildings. The model generates the
-    other objects around them (default: none)."""
+    """Categories whose objects are kept in the region, such as construction_big for buildings. The model adds no
+    objects of these categories, and none inside of kept objects. Not for --contents ground (default: none)."""
     num_variants: int = 1
     """Number of different results per scene."""
     output: str = ""

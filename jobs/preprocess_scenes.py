@@ -127,7 +127,7 @@ class Osm:
     """Add parked vehicles, pedestrians, plants, lamps, signals, signs, sidewalks and front gardens that the extract
     lacks, with the rules of the town. The labels of added objects begin with "furnished"."""
     unmapped_ground: Literal["none", "terrain"] = "none"
-    """Ground class of land that the map leaves open, except buildings and water."""
+    """Ground class of land that the map leaves open, except below buildings and water."""
     seed: int = 0
     """Random seed of free poses and added objects."""
     slots: Literal["p95", "p99.5", "paper"] = "p99.5"
@@ -148,7 +148,7 @@ class OpenDrive:
     spacing_m: float = 10.0
     """Distance between successive poses along a lane."""
     unmapped_ground: Literal["none", "terrain"] = "none"
-    """Ground class of land that the map leaves open, except buildings and water."""
+    """Ground class of land that the file leaves open, except below buildings."""
     test_share: float = 0.1
     """Maximum share of the scenes that lie in test squares of 400 m; 0 makes no test split."""
     slots: Literal["p95", "p99.5", "paper"] = "p99.5"

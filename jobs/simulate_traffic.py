@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Simulate traffic on the streets of scenes with SUMO, and score their road networks.
 
-    jobs/simulate_traffic.py --input DIR                              one after the other: 120 s of traffic per scene
+    jobs/simulate_traffic.py --input DIR                              all scenes, 120 s of traffic each
     jobs/simulate_traffic.py --input DIR --vehicles-per-min 60 --max-scenes 10
     jobs/simulate_traffic.py --input DIR --reference OTHER            next to scenes that were simulated before
 
@@ -41,8 +41,8 @@ class Config(SceneOptions):
     """Dataset directory with the table traffic of other scenes, such as real ones, to show next to the scores
     (default: none)."""
     slab_offset_m: float | None = None
-    """Height of the ground rasters above the surface on which objects stand, in metres (default: that of the source;
-    0.3 for generated scenes)."""
+    """Height of the ground rasters above the surface on which objects stand, in metres (default: 0 for av2, osm,
+    opendrive, own and py123d, and 0.3 for all other sources)."""
     num_examples: int = 3
     """Number of scenes with a moving picture."""
     output: str = ""

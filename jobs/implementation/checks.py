@@ -29,7 +29,7 @@ from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 
 MAX_PLACE_M = 1024.0
-MAX_TRAFFIC_S, MAX_VEHICLES_PER_MIN = 3600.0, 600.0
+MAX_TRAFFIC_S, MAX_ROAD_USERS = 3600.0, 2000
 DENSITY_GROUPS = {"vegetation": VEGETATION, "vehicle": VEHICLES}  # Categories that each density label counts.
 
 
@@ -193,11 +193,15 @@ def check_simulate_traffic(config: TrafficConfig) -> None:
         raise ValueError("--pedestrians-per-min and --num-examples are 0 or more")
     if config.time_step_s < 0.25 or config.time_step_s % 0.25:
         raise ValueError(f"--time-step-s is {config.time_step_s:g}, expected a multiple of 0.25")
-    if config.duration_s > MAX_TRAFFIC_S or config.vehicles_per_min > MAX_VEHICLES_PER_MIN:
+    rates = config.vehicles_per_min, config.pedestrians_per_min
+    count = config.duration_s * sum(rates) / 60
+    if not (config.duration_s <= MAX_TRAFFIC_S and all(rate >= 0 for rate in rates) and count <= MAX_ROAD_USERS):
         raise ValueError(
-            f"--duration-s is {config.duration_s:g} and --vehicles-per-min is {config.vehicles_per_min:g}, expected at"
-            f" most {MAX_TRAFFIC_S:g} and {MAX_VEHICLES_PER_MIN:g}"
+            f"--duration-s is {config.duration_s:g}, and the rates give {count:g} road users per scene; expected at"
+            f" most {MAX_TRAFFIC_S:g} s and {MAX_ROAD_USERS} road users"
         )
+    if config.seed < 0:
+        raise ValueError(f"--seed is {config.seed}, expected 0 or more")
 
 
 def check_publish_model(config: PublishConfig) -> None:

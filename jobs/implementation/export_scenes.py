@@ -19,7 +19,7 @@ def export(config: Config) -> tuple[str, dict[str, int], dict[str, str]]:
         reason.
     """
     if not config.formats:
-        raise ValueError("--formats is empty, expected one or more of glb, ply, npz, xodr, geojson, geoparquet")
+        raise ValueError("--formats is empty, expected one or more of glb, ply, npz, xodr, geojson, geoparquet, usd")
     selection = select_scenes(config)
     output = make_absolute(config.output) if config.output else storage.join_uri(selection.root, "export")
     total = sum(len(rows) for _, rows in selection.shards())

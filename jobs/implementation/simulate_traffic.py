@@ -8,14 +8,14 @@ import pyarrow as pa
 
 from jobs.implementation.checks import check_simulate_traffic
 from jobs.simulate_traffic import Config
-from jobs.support.cli import make_absolute, resolve_path
+from jobs.support.cli import make_absolute
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import select_scenes
 from pipelines.rendering.street_views import encode_animation
 from pipelines.rendering.traffic_view import render_traffic
 from pipelines.reporting.report import Picture
-from pipelines.reporting.traffic_report import count_failures, render_traffic_html, summarise_traffic
+from pipelines.reporting.traffic_report import count_failures, count_simulated, render_traffic_html, summarise_traffic
 from pipelines.runtime import storage
 from pipelines.schema.file_names import make_file_name
 from pipelines.schema.scene_subset import SceneSubset
@@ -59,14 +59,15 @@ def main(config: Config) -> None:
     output = make_absolute(config.output) if config.output else selection.root
     demand = Demand(config.duration_s, config.vehicles_per_min, config.pedestrians_per_min, config.time_step_s)
     request = TrafficRequest(output, demand, config.seed, config.slab_offset_m, config.control)
+    reference = find_shards(make_absolute(config.reference), "traffic") if config.reference else []
     with hold_output(output, "traffic", config), JobProgress() as bar:
         shown = bar.add_task("simulate", total=sum(len(rows) for _, rows in selection.shards()))
         shards = simulate_dataset(request, selection, lambda count: bar.advance(shown, count))
         sets = {SCENES: read_traffic(shards, False)}
         if config.control:
             sets[CONTROL] = read_traffic(shards, True)
-        if config.reference:
-            sets[REFERENCE] = read_traffic(find_shards(resolve_path(config.reference), "traffic"), False)
+        if reference:
+            sets[REFERENCE] = read_traffic(reference, False)
         pictures, videos = write_videos(output, selection, config.num_examples, config.time_step_s)
         options = asdict(demand) | {"seed": config.seed}
         page = storage.join_uri(output, "traffic.html")
@@ -74,7 +75,7 @@ def main(config: Config) -> None:
     for name, table in sets.items():
         scores = summarise_traffic(table)
         text = ", ".join(f"{key} {value.value:.3g}" for key, value in scores.items() if value is not None)
-        print(f"{name} ({len(table)}): {text or 'no scene could be simulated'}")
+        print(f"{name} ({count_simulated(table)} of {len(table)}): {text or 'no scene could be simulated'}")
     for reason, count in list(count_failures(sets[SCENES]).items())[:5]:
         print(f"  {count} without simulation: {reason}")
     print(f"tables tracks and traffic, traffic.html and traffic_videos in {output}")

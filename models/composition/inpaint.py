@@ -191,7 +191,8 @@ def select_kept_pixels(scene: Scene, keep: Sequence[str], cell_px: int) -> np.nd
     row, col = scene.grid.pixel(x_m[inside], y_m[inside])
     at = np.arange(cell_px)
     row, col = row // cell_px * cell_px, col // cell_px * cell_px
-    found[(row[:, None] + at)[:, :, None], (col[:, None] + at)[:, None, :]] = True
+    rows, cols = np.minimum(row[:, None] + at, scene.grid.rows - 1), np.minimum(col[:, None] + at, scene.grid.cols - 1)
+    found[rows[:, :, None], cols[:, None, :]] = True
     return found
 
 

@@ -1,4 +1,4 @@
-"""Export scenes as GLB, PLY, voxels, OpenDRIVE, GeoJSON or GeoParquet, with one Ray task per shard."""
+"""Export scenes as GLB, PLY, voxels, OpenDRIVE, GeoJSON, GeoParquet or USD, with one Ray task per shard."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pipelines.io.geojson import export_geojson
 from pipelines.io.geoparquet import export_geoparquet
 from pipelines.io.mesh_export import export_glb, export_ply
 from pipelines.io.opendrive import export_opendrive
+from pipelines.io.usd import export_usd
 from pipelines.io.voxel_import import export_voxels_npz
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_tasks
@@ -18,7 +19,7 @@ from pipelines.schema.file_names import make_file_name
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 
-Format = Literal["glb", "ply", "npz", "xodr", "geojson", "geoparquet"]
+Format = Literal["glb", "ply", "npz", "xodr", "geojson", "geoparquet", "usd"]
 NOTICE = "NOTICE.txt"  # Licence notices of all exported scenes.
 WRITERS: dict[str, Callable[[Scene], bytes]] = {
     "glb": export_glb,
@@ -27,6 +28,7 @@ WRITERS: dict[str, Callable[[Scene], bytes]] = {
     "xodr": export_opendrive,
     "geojson": export_geojson,
     "geoparquet": export_geoparquet,
+    "usd": export_usd,
 }
 
 

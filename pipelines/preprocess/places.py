@@ -64,7 +64,10 @@ def read_place(path: str, options: PlaceOptions, resolution_m: float, number: in
     distance_m = np.abs(poses_m[:, :2] - middle_m).max(axis=1)
     if not len(distance_m) or distance_m.min() > half_m:
         found = f"the nearest is {distance_m.min():.0f} m away" if len(distance_m) else "the file has none nearby"
-        raise ValueError(f"{path}: no street lies within {half_m:g} m of the middle of the place; {found}")
+        raise ValueError(
+            f"{path}: no street lies within {half_m:g} m of the middle of the place; {found}; choose another --origin"
+            " or a larger --size-m"
+        )
     nearest = poses_m[distance_m.argmin()]
     ground_m = (nearest if options.origin is None else np.append(middle_m, nearest[2])) - [0.0, 0.0, IMU_HEIGHT_M]
     here = make_world_from_imu(ground_m[None], np.array([np.pi / 2 - np.deg2rad(options.heading_deg)]))

@@ -24,7 +24,7 @@ def render_traffic(scene: Scene, tracks: pa.Table, size_px: int = 512, duration_
         scene: Scene.
         tracks: Rows of the table tracks of this scene.
         size_px: Number of pixels of the longer side.
-        duration_s: Time that is shown, from the start (s).
+        duration_s: Time that is shown, from the first road user (s).
 
     Returns:
         One image (H, W, 3) uint8 per time.
@@ -35,7 +35,8 @@ def render_traffic(scene: Scene, tracks: pa.Table, size_px: int = 512, duration_
     table = {name: tracks[name].to_numpy() for name in ("time_s", "x_m", "y_m", "yaw_rad", "length_m", "width_m")}
     categories = np.array(tracks["category"].to_pylist())
     frames = []
-    for time_s in np.unique(table["time_s"][table["time_s"] <= duration_s]):
+    times_s = np.unique(table["time_s"])
+    for time_s in times_s[times_s <= times_s[:1] + duration_s]:
         now = table["time_s"] == time_s
         xy_m = np.stack([table["x_m"][now], table["y_m"][now]], axis=1)
         size_m = np.stack([table["length_m"][now], table["width_m"][now]], axis=1).clip(0.8)

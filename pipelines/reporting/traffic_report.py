@@ -13,9 +13,15 @@ from pipelines.reporting.report import Picture, Pictures, Section, Table, render
 
 # Name of each score, its numerator and denominator in the table traffic, factor and meaning. None: per scene.
 SCORES = (
-    ("arrived", ("arrived",), "inserted", 1.0, "share of vehicles that left the scene"),
+    ("arrived", ("arrived",), "inserted", 1.0, "share of vehicles that left the scene without a teleport"),
     ("routed", ("routed",), "requested", 1.0, "share of pairs of a road in and a road out of the scene with a route"),
-    ("unreachable_roads", ("unreachable_roads",), "roads", 1.0, "share of roads that no route uses"),
+    (
+        "unreachable_roads",
+        ("unreachable_roads",),
+        "roads",
+        1.0,
+        "share of roads on which no vehicle can drive from an entry to an exit",
+    ),
     ("collisions_per_100", ("collisions",), "inserted", 100.0, "collisions between vehicles per 100 vehicles"),
     ("teleports_per_100", ("teleports",), "inserted", 100.0, "vehicles moved out of a jam, per 100 vehicles"),
     ("parked_contacts", ("parked_contacts",), "inserted", 1.0, "share of vehicles that touched a parked vehicle"),
@@ -44,6 +50,18 @@ def summarise_traffic(table: pa.Table) -> dict[str, Estimate | None]:
         below = weights @ rows[denominator].to_numpy().astype(float) if denominator else np.ones(len(weights))
         found[name] = make_estimate(factor * above / below) if below[0] and (below > 0).all() else None
     return found
+
+
+def count_simulated(table: pa.Table) -> int:
+    """Count the scenes with a simulation.
+
+    Args:
+        table: Rows of the table traffic.
+
+    Returns:
+        Number of rows without a failure.
+    """
+    return table["failure"].null_count
 
 
 def count_failures(table: pa.Table) -> dict[str, int]:
@@ -82,11 +100,11 @@ def render_traffic_html(
     sections: list[Section] = [
         Table(
             "Health of the road network",
-            ("score", *(f"{name} ({len(table)})" for name, table in sets.items())),
+            ("score", *(f"{name} ({count_simulated(table)} of {len(table)})" for name, table in sets.items())),
             shown,
             [meaning for *_, meaning in SCORES],
-            "Values with 95 % intervals over scenes; the number of scenes is in brackets. The control closes roads of"
-            " the same scenes: a score that does not get worse there does not measure the network.",
+            "Values with 95 % intervals over scenes; the number of simulated scenes is in brackets. The control closes"
+            " roads of the same scenes: a score that does not get worse there does not measure the network.",
         )
     ]
     failures = [[name, reason, n] for name, table in sets.items() for reason, n in count_failures(table).items()]

@@ -71,7 +71,7 @@ def fingerprint_files(uris: Sequence[str]) -> list[list[str | int]]:
     for directory in {split_name(uri)[0] for uri in uris}:
         fs, path = resolve_uri(directory)
         found = fs.get_file_info(pafs.FileSelector(path, allow_not_found=True))
-        listed[directory] = {info.base_name: _make_fingerprint(info) for info in found}
+        listed[directory] = {info.base_name: _make_fingerprint(info) for info in found if info.is_file}
     prints = []
     for uri in uris:
         directory, name = split_name(uri)

@@ -217,14 +217,15 @@ TRAFFIC = _make_schema(
     ("control",   pa.bool_(),   "",
      "true for the copy of the scene with closed roads, which has no rows in tracks; false for the scene."),
     ("failure",   pa.string(),  "",
-     "Reason why there is no simulation, such as a scene without roads; the other columns are then null."),
+     "Reason why there is no simulation, such as a scene without roads or without a route; all later columns are then "
+     "null. null after a simulation."),
     ("roads",             pa.int32(), "1", "Number of edges of the network: directions of roads between junctions."),
     ("one_way_roads",     pa.int32(), "1",
-     "Number of roads that are too narrow for two directions between parked vehicles; they have one direction."),
+     "Number of roads that are too narrow for two directions and have lost one."),
     ("unreachable_roads", pa.int32(), "1",
      "Number of edges on which no vehicle can drive from one border of the scene to another."),
     ("network_warnings",  pa.int32(), "1", "Number of warnings of SUMO's netconvert."),
-    ("requested",         pa.int32(), "1", "Number of random pairs of a road that enters and a road that leaves."),
+    ("requested",         pa.int32(), "1", "Number of random pairs of an entry and an exit of the scene."),
     ("routed",            pa.int32(), "1", "Number of these pairs with a route; each is a vehicle."),
     ("inserted",          pa.int32(), "1", "Number of vehicles in the simulation, with those that start inside."),
     ("arrived",           pa.int32(), "1", "Number of inserted vehicles that left the scene, without teleports."),
@@ -236,7 +237,7 @@ TRAFFIC = _make_schema(
     ("fixed_contacts",    pa.int32(), "1",
      "Number of vehicles that overlapped a building, wall, pole or object by more than 0.1 m."),
     ("pedestrians",       pa.int32(), "1", "Number of pedestrians in the simulation."),
-    ("mean_distance_m",   pa.float64(), "m",   "Mean length of the ways of arrived vehicles."),
+    ("mean_distance_m",   pa.float64(), "m",   "Mean route length of arrived vehicles."),
     ("mean_speed_mps",    pa.float64(), "m/s", "Mean speed of arrived vehicles."),
 )
 

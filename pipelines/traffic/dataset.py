@@ -21,7 +21,7 @@ from pipelines.schema.tables import Shard
 from pipelines.traffic.demand import KINDS, Demand
 from pipelines.traffic.obstacles import close_roads
 from pipelines.traffic.simulation import TrafficHealth, simulate_scene
-from pipelines.traffic.sumo import require_sumo
+from pipelines.traffic.sumo import check_sumo, require_sumo
 from pipelines.traffic.tracks import Tracks
 
 PART_SCENES = 2  # Number of scenes per task.
@@ -135,13 +135,13 @@ def simulate_part(part: Part) -> PartResult:
     Raises:
         RuntimeError: SUMO is not installed on this node.
     """
-    require_sumo()
+    check_sumo(require_sumo())
     request, (shard, rows) = part.request, part[1:]
     found = PartResult(shard, {}, {})
     for number, scene in zip(rows, shard.scenes(rows), strict=True):
         table, records = TRACKS.empty_table(), []
         for control in (False, True) if request.control else (False,):
-            tracks, health, failure = try_scene(close_roads(scene, request.seed) if control else scene, request)
+            tracks, health, failure = try_scene(scene, request, control)
             records.append(make_traffic_row(scene.scene_id, control, health, failure))
             if tracks is not None and not control:
                 table = make_tracks_table(scene.scene_id, tracks)
@@ -150,21 +150,26 @@ def simulate_part(part: Part) -> PartResult:
     return found
 
 
-def try_scene(scene: Scene, request: TrafficRequest) -> tuple[Tracks | None, TrafficHealth | None, str | None]:
+def try_scene(
+    scene: Scene, request: TrafficRequest, control: bool
+) -> tuple[Tracks | None, TrafficHealth | None, str | None]:
     """Simulate a scene.
 
     Args:
         scene: Scene.
         request: Options.
+        control: Whether to simulate the copy of the scene with closed roads.
 
     Returns:
         Trajectories, health, and None; or None, None, and the reason why there is no simulation.
     """
     try:
+        scene = close_roads(scene, request.seed) if control else scene
         offset_m = request.find_slab_offset(scene.source)
         return *simulate_scene(scene, request.demand, request.seed, offset_m), None
-    except (ValueError, RuntimeError) as error:
-        return None, None, str(error)[:500]
+    except Exception as error:  # One scene must not stop the others.
+        kind = "" if isinstance(error, (ValueError, RuntimeError)) else f"{type(error).__name__}: "
+        return None, None, f"{kind}{error}"[:500]
 
 
 def simulate_dataset(
@@ -186,7 +191,7 @@ def simulate_dataset(
         RuntimeError: SUMO is not installed.
         ValueError: The output contains tracks with other options.
     """
-    require_sumo()
+    check_sumo(require_sumo())
     options = asdict(request) | {"input": selection.to_record(), "scenes": selection.fingerprint()}
     del options["output"]
     places = [storage.join_uri(request.output, table) for table in TRAFFIC_TABLES]

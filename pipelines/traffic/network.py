@@ -63,8 +63,8 @@ class Network:
 
     def count_unreachable(self) -> int:
         """Return the number of edges on which no vehicle can drive from an entry to an exit of the scene."""
-        ahead = set().union(*(nx.descendants(self.graph, edge) | {edge} for edge in self.entries & set(self.graph)))
-        behind = set().union(*(nx.ancestors(self.graph, edge) | {edge} for edge in self.exits & set(self.graph)))
+        ahead = _list_reachable(self.graph, self.entries)
+        behind = _list_reachable(self.graph.reverse(copy=False), self.exits)
         return len(self.graph) - len(ahead & behind)
 
     def list_narrow_roads(self) -> list[tuple[str, str]]:
@@ -111,6 +111,12 @@ class Network:
                 if distance[k] < (2.0 if best is None else best[0]) and abs(np.cos(turn)) > 0.8:
                     best = float(distance[k]), edge, lane, float(length[:k].sum() + along[k])
         return None if best is None else best[1:]
+
+
+def _list_reachable(graph: Any, starts: set[str]) -> set[str]:
+    """Return the edges that can be reached from some edges, with these edges."""
+    starts = starts & set(graph)
+    return set(nx.multi_source_dijkstra_path_length(graph, starts, weight=None)) if starts else set()
 
 
 def build_network(scene: Scene, home: Path, folder: Path) -> Network:

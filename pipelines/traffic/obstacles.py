@@ -64,7 +64,7 @@ def remove_occupied_road(scene: Scene, parked: np.ndarray) -> Scene:
     y, x = np.ogrid[-radius : radius + 1, -radius : radius + 1]
     wide = np.pad(road & ~taken, radius, mode="edge")
     opened = np.asarray(binary_opening(wide, x * x + y * y <= radius * radius))
-    free = opened[radius:-radius, radius:-radius]
+    free = opened[radius : radius + road.shape[0], radius : radius + road.shape[1]]
     # Narrow parts of the road that no parked vehicle touches are kept.
     others = np.logical_not(taken)
     near = np.asarray(distance_transform_edt(others)) * scene.grid.resolution_m <= GAP_M

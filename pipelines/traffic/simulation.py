@@ -225,7 +225,7 @@ def measure_health(
         requested=routes.requested,
         routed=routes.routed,
         inserted=count("vehicles", "inserted"),
-        arrived=len(trips) - count("teleports", "total") if trips else 0,
+        arrived=max(0, len(trips) - count("teleports", "total")),
         teleports=count("teleports", "total"),
         collisions=len(hits) - on_foot,
         pedestrian_collisions=on_foot,

@@ -10,6 +10,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+from functools import lru_cache
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -41,6 +42,20 @@ def require_sumo() -> Path:
             "SUMO is not installed; install the extra traffic (pip install 'pritti-on-ray[traffic]') or set SUMO_HOME"
         )
     return home
+
+
+@lru_cache
+def check_sumo(home: Path) -> None:
+    """Check that the programs of SUMO start, once per process.
+
+    Args:
+        home: Home directory of SUMO.
+
+    Raises:
+        RuntimeError: A program does not start, for example because a library is missing.
+    """
+    for program in ("bin/netconvert", "bin/sumo"):
+        run_program(home, program, "--version")
 
 
 def run_program(home: Path, program: str, *arguments: object) -> str:

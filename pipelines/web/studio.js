@@ -24,6 +24,7 @@ async function act(path, body, keep = false) {
 }
 
 async function show(state, keep = false) {
+  playing = false; viewer.showMoving(null);
   scene = state.scene;
   $("undo").disabled = !state.undo; $("undo").title = state.undo ?? "";
   $("redo").disabled = !state.redo; $("redo").title = state.redo ?? "";
@@ -83,8 +84,12 @@ let traffic = { objects: [], driving: [] }, began = 0, playing = false, traced =
 const SPEED = 2, HIDDEN = [0.001, 0.001, 0.001];
 
 async function loadTraffic() {
-  if (scene?.scene_id !== traced) { traced = scene?.scene_id ?? ""; traffic = scene ? await ask("/api/tracks") : { objects: [], driving: [] }; }
-  playing = false;
+  // After an edit, the indices of the vehicles in traffic may be others.
+  const key = scene ? scene.scene_id + JSON.stringify(scene.primitives.map((p) => [p.category, p.center_m])) : "";
+  if (key !== traced) {
+    traced = key; traffic = { objects: [], driving: [] };
+    if (scene) try { traffic = await ask("/api/tracks"); } catch (error) { traced = ""; say(error.message, true); }
+  }
   $("play").hidden = !traffic.objects.length; $("play").textContent = "▶ Traffic";
 }
 

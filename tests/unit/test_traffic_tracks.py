@@ -284,6 +284,7 @@ def test_scene_without_road_is_a_failure_and_the_rest_continues(tmp_path, monkey
 
     monkeypatch.setattr(dataset, "simulate_scene", simulate)
     monkeypatch.setattr(dataset, "require_sumo", lambda: Path("sumo"))
+    monkeypatch.setattr(dataset, "check_sumo", lambda home: None)
     monkeypatch.setattr("pipelines.traffic.simulation.require_sumo", lambda: Path("sumo"))
     found = simulate_part(dataset.Part(TrafficRequest(str(tmp_path), Demand(), control=False), shard, [0, 1]))
     reasons = [found.traffic[k]["failure"][0].as_py() for k in (0, 1)]

@@ -1,7 +1,7 @@
 """Define Drive, which holds all annotations along one sequence in the world frame.
 
 Each reader returns a Drive. The same code therefore crops the Scenes of all sources (paper, supplement A, Dataset
-Construction). This module depends only on numpy and scipy. The town can therefore be used without ray or pyarrow.
+Construction). This module depends only on numpy. The town can therefore be used without ray or pyarrow.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from models.limits import require_within
 from models.scene import Grid, Scene, canonicalize_boxes, make_yaw_rotation
@@ -329,6 +328,8 @@ class LayeredGround:
                 occupied[index] |= seen
             free &= ~covered[layer]
         if self.fill_class is not None and free.any() and occupied.any():
+            from scipy.ndimage import distance_transform_edt  # The town needs only numpy.
+
             _, (row, col) = cast(tuple, distance_transform_edt(~occupied.any(axis=0), return_indices=True))
             nearest_m = height.max(axis=0, where=occupied, initial=-np.inf)[row, col]
             height[self.fill_class][free] = nearest_m[free]

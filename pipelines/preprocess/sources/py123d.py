@@ -43,8 +43,9 @@ GROUND_CLASSES = ("road", "sidewalk", "parking", "crossing")
 LAYERS = {0: "road", 1: "road", 2: "road", 3: "crossing", 4: "sidewalk", 5: "parking", 6: "road"}
 LINES = (8, 9)  # Map layers that are lines (road edges and road lines), which have heights.
 MAX_POSE_GAP_US = 60_000  # Largest difference between the times of boxes and of the pose of the vehicle.
-MAX_HEIGHT_REACH_M = 30.0  # Largest distance of a line whose height an area gets; otherwise that of the vehicle's way.
+MAX_HEIGHT_REACH_M = 30.0  # Largest distance of a line whose height an area gets; otherwise that of the trajectory.
 MAX_COORDINATE_M, MAX_SIZE_M, MIN_SIZE_M = 1e7, 1e2, 1e-3
+REACH_M = 200.0  # Distance from the trajectory up to which areas of a map are read.
 MAX_POINTS = 2_000  # Points of an outline; others are simplified.
 ATTRIBUTED = {"av2-sensor": "av2", "kitti360": "kitti360"}  # Datasets of py123d with a notice, and its source.
 
@@ -178,14 +179,14 @@ def read_drive(root: str | PathLike, split: str, log: str) -> tuple[Drive, int]:
             f"{folder}: no pose within {MAX_POSE_GAP_US / 1000:g} ms of the boxes at {times[far.argmax()]}; {AGAIN}"
         )
     map_path = _find_map(root, folder, about)
-    way_m = poses[:, :, 3] - [0.0, 0.0, ground_below_m]
+    trajectory_m = poses[:, :, 3] - [0.0, 0.0, ground_below_m]
     dataset = str(about.get("dataset", ""))
     drive = MapDrive(
         source=SOURCE,
         sequence=log,
         **boxes,
         ground_classes=GROUND_CLASSES,
-        ground=_read_ground(map_path, way_m),
+        ground=_read_ground(map_path, trajectory_m),
         frame=times,
         world_from_imu=poses[nearest],
         attribution=find_attribution(ATTRIBUTED.get(dataset, "")),
@@ -237,7 +238,9 @@ def _read_column(path: InputPath, table: pa.Table, name: str, kind: Any) -> pa.A
 def _check(path: InputPath, name: str, values: np.ndarray, low: float, high: float) -> None:
     bad = np.argwhere(~((values >= low) & (values <= high)))
     if len(bad):
-        raise ValueError(f"{path}: {name} {values[tuple(bad[0])]:g} of entry {bad[0][0]}, expected {low:g}..{high:g}")
+        raise ValueError(
+            f"{path}: {name} {values[tuple(bad[0])]:g} of entry {bad[0][0]}, expected {low:g}..{high:g}; {AGAIN}"
+        )
 
 
 def _make_rotations(path: InputPath, quaternions: np.ndarray) -> np.ndarray:
@@ -274,11 +277,16 @@ def _read_boxes(path: InputPath) -> tuple[dict[str, np.ndarray], int]:
     table = _read_arrow(path)
     name = str(_read_metadata(path, table).get("box_detection_label_class", "")).rpartition(".")[2]
     if name not in LABELS:
-        raise ValueError(f"{path}: unknown label class {name[:60]!r}, expected one of {', '.join(LABELS)}")
+        raise ValueError(
+            f"{path}: unknown label class {name[:60]!r}, expected one of {', '.join(LABELS)};"
+            " convert the log with py123d 0.7"
+        )
     time = _read_column(path, table, "box_detections_se3.timestamp_us", pa.int64()).to_numpy()
     boxes = _read_column(path, table, "box_detections_se3.bounding_box_se3", pa.list_(pa.list_(pa.float64(), 10)))
     tokens = _read_column(path, table, "box_detections_se3.track_token", pa.list_(pa.string()))
     labels = _read_column(path, table, "box_detections_se3.label", pa.list_(pa.uint16()))
+    if any(column.null_count for column in (boxes.flatten(), boxes.flatten().flatten(), labels.flatten())):
+        raise ValueError(f"{path}: a box or a label is null; {AGAIN}")
     count = np.diff(boxes.offsets.to_numpy())
     for other, column in (("track_token", tokens), ("label", labels)):
         if not np.array_equal(np.diff(column.offsets.to_numpy()), count):
@@ -321,21 +329,26 @@ def _hash_tracks(tracks: np.ndarray) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------------- map
 
 
-def _find_map(root: str | PathLike, folder: InputPath, about: dict[str, Any]) -> InputPath:
-    """Return the file of the map of a log."""
+def _find_map(root: str | PathLike, folder: InputPath, about: dict[str, Any]) -> InputPath | None:
+    """Return the file of the map of a log; None if the dataset has no maps."""
     own = folder / "map.arrow"
     described = about.get("map_metadata")
-    if own.is_file() or not isinstance(described, dict):
+    if own.is_file():
         return own
+    if not isinstance(described, dict):
+        return None
     dataset, place = (str(described.get(name, "")) for name in ("dataset", "location"))
     if not all(part and part.replace("-", "").replace("_", "").isalnum() for part in (dataset, place)):
         raise ValueError(f"{folder}: map of dataset {dataset[:40]!r} and location {place[:40]!r}; {AGAIN}")
     return make_input_path(root, "maps", dataset, f"{dataset}_{place}.arrow")
 
 
-def _read_ground(path: InputPath, way_m: np.ndarray) -> SurfaceGround:
-    """Return the areas of a map as triangles. Their heights are those of near lines, or of the way of the vehicle."""
+def _read_ground(path: InputPath | None, trajectory_m: np.ndarray) -> SurfaceGround:
+    """Return the areas of a map as triangles. Their heights are those of near lines, or of the vehicle's trajectory."""
+    if path is None:
+        return SurfaceGround(np.zeros((0, 3, 3)), np.zeros(0, np.int64))
     table = _read_arrow(path)
+    has_heights = bool(_read_metadata(path, table).get("map_has_z", True))
     layer = _read_column(path, table, "map_layer", pa.int8()).to_numpy()
     wkb = _read_column(path, table, "wkb", pa.binary())
     chosen = np.flatnonzero(np.isin(layer, [*LAYERS, *LINES]))
@@ -344,9 +357,15 @@ def _read_ground(path: InputPath, way_m: np.ndarray) -> SurfaceGround:
     except shapely.errors.GEOSException as error:
         raise ValueError(f"{path}: broken geometry ({str(error)[:80]}); {AGAIN}") from error
     layer = layer[chosen]
+    if not np.isfinite(shapely.get_coordinates(shapes)).all():
+        raise ValueError(f"{path}: broken geometry (a coordinate is not finite); {AGAIN}")
+    bounds = shapely.bounds(shapes)  # Maps of cities are much larger than the area of a log.
+    low_m, high_m = trajectory_m[:, :2].min(axis=0) - REACH_M, trajectory_m[:, :2].max(axis=0) + REACH_M
+    near = (bounds[:, :2] <= high_m).all(axis=1) & (bounds[:, 2:] >= low_m).all(axis=1)
+    shapes, layer = shapes[near], layer[near]
     is_line = np.isin(layer, LINES)
     points = shapely.get_coordinates(shapes[is_line], include_z=True)
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[np.isfinite(points).all(axis=1) & has_heights]
     triangles, classes = [np.zeros((0, 3, 2))], [np.zeros(0, np.int64)]
     for shape, name in _list_areas(shapes[~is_line], layer[~is_line]):
         pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(shape))
@@ -354,7 +373,7 @@ def _read_ground(path: InputPath, way_m: np.ndarray) -> SurfaceGround:
         triangles.append(flat)
         classes.append(np.full(len(flat), GROUND_CLASSES.index(name)))
     flat = np.concatenate(triangles)
-    height_m = _find_heights(flat.reshape(-1, 2), points, way_m).reshape(-1, 3, 1)
+    height_m = _find_heights(flat.reshape(-1, 2), points, trajectory_m).reshape(-1, 3, 1)
     return SurfaceGround(np.concatenate([flat, height_m], axis=2), np.concatenate(classes))
 
 
@@ -369,10 +388,10 @@ def _list_areas(shapes: np.ndarray, layer: np.ndarray) -> Iterator[tuple[Any, st
                 yield part if shapely.get_num_coordinates(part) <= MAX_POINTS else part.simplify(0.1), LAYERS[number]
 
 
-def _find_heights(xy_m: np.ndarray, points_m: np.ndarray, way_m: np.ndarray) -> np.ndarray:
-    """Return heights (n,) of points (n, 2): that of the nearest point of a line, or of the way of the vehicle."""
-    _, index = cKDTree(way_m[:, :2]).query(xy_m)
-    height_m = way_m[index, 2]
+def _find_heights(xy_m: np.ndarray, points_m: np.ndarray, trajectory_m: np.ndarray) -> np.ndarray:
+    """Return heights (n,) of points (n, 2): that of the nearest point of a line, or of the trajectory."""
+    _, index = cKDTree(trajectory_m[:, :2]).query(xy_m)
+    height_m = trajectory_m[index, 2]
     if len(points_m):
         distance_m, index = cKDTree(points_m[:, :2]).query(xy_m)
         height_m = np.where(distance_m <= MAX_HEIGHT_REACH_M, points_m[index, 2], height_m)
