@@ -43,9 +43,12 @@ def test_job_writes_tables_page_and_videos_and_resumes(cluster, tmp_path):
     page = (tmp_path / "traffic.html").read_text()
     assert "Health of the road network" in page and "has no road" in page
     assert len(list((tmp_path / "traffic_videos").iterdir())) == 1
-    assert json.loads((tmp_path / "traffic.json").read_text())["seed"] == 0
+    assert json.loads((tmp_path / "traffic-town-test.json").read_text())["seed"] == 0
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.parquet")}
     main(config)
     assert times == {path: path.stat().st_mtime_ns for path in times}
     with pytest.raises(ValueError, match="holds traffic with seed=0, asked for 1; choose another --output"):
         main(replace(config, seed=1))
+    Shard(str(tmp_path), "generated-other", "generated", 0).write([replace(scenes[0], scene_id="other")])
+    main(replace(config, source="generated-other", seed=1, control=False))  # Other sources have their own options.
+    assert Shard(str(tmp_path), "generated-other", "generated", 0).read("traffic").num_rows == 1
