@@ -63,7 +63,7 @@ def write_pictures(output: str, run: str, selection: SceneSubset, request: Inpai
     given = [shard.scenes([row])[0] for shard, rows in selection.shards() for row in rows]
     for number, scene in enumerate(given):
         notice = f" {scene.attribution.split(', ')[0]}" if scene.attribution else ""
-        made = [from_model_surface(one, scene.source, spec) for one in request.shard(number).scenes()]
+        made = [from_model_surface(one, scene, spec) for one in request.shard(number).scenes()]
         pictures = [render_3d(one, WIDTH_PX, HEIGHT_PX, AZIMUTH_DEG, ELEVATION_DEG) for one in (scene, *made)]
         captions = [f"map{notice}", *(f"furnished map{notice}" for _ in made)]
         data = encode_png(arrange_contact_sheet(pictures, 2, captions))

@@ -244,10 +244,11 @@ class Inpainter:
     def __call__(self, row: dict) -> dict:
         request, shard = self.request, self.request.shard(row["id"])
         source, position = self.chosen[row["id"]]
-        made, drifts = inpaint_one(self.pipeline, request, source.scenes([position])[0], row["id"])
+        given = source.scenes([position])[0]
+        made, drifts = inpaint_one(self.pipeline, request, given, row["id"])
         for scene in made:
             path = storage.join_uri(request.output, "glb", request.run, f"{make_file_name(scene.scene_id)}.glb")
-            shown = from_model_surface(scene, source.source, self.pipeline.spec)
+            shown = from_model_surface(scene, given, self.pipeline.spec)
             storage.write_whole(path, lambda stream, scene=shown: stream.write(export_glb(scene)))
         storage.write_json(drifts, make_drift_path(request, row["id"]))
         shard.write(made)

@@ -23,7 +23,7 @@ from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
 from pipelines.runtime.resources import find_device
 from pipelines.schema.columns import SCENE_TABLES
-from pipelines.schema.dataset import SURFACE
+from pipelines.schema.dataset import find_surface
 from pipelines.schema.run_guard import guard_run
 from pipelines.schema.tables import Shard, find_unwritten, require_written
 from pipelines.training.latents import digest_weights
@@ -215,27 +215,26 @@ def to_model_surface(scene: Scene, spec: LayoutSpec) -> Scene:
     Returns:
         The same scene, or a scene whose ground is higher or lower by SLAB_OFFSET_M.
     """
-    return _raise_ground(scene, _find_surface_offset(scene.source, spec))
+    return _raise_ground(scene, _find_surface_offset(scene, spec))
 
 
-def from_model_surface(scene: Scene, source: str, spec: LayoutSpec) -> Scene:
-    """Convert the ground heights of a generated scene to the reference surface of a source.
+def from_model_surface(scene: Scene, given: Scene, spec: LayoutSpec) -> Scene:
+    """Convert the ground heights of a generated scene to the reference surface of its input.
 
     Args:
         scene: Scene.
-        source: Source of the scene from which it was generated.
+        given: Scene from which it was generated.
         spec: Layout of the model.
 
     Returns:
         The scene.
     """
-    return _raise_ground(scene, -_find_surface_offset(source, spec))
+    return _raise_ground(scene, -_find_surface_offset(given, spec))
 
 
-def _find_surface_offset(source: str, spec: LayoutSpec) -> float:
-    """Return the height of the reference surface of the model above that of a source (m); 0 for generated scenes."""
-    surface = SURFACE.get(source, spec.surface)
-    return spec.slab_offset_m - (SLAB_OFFSET_M if surface == "top" else 0.0)
+def _find_surface_offset(scene: Scene, spec: LayoutSpec) -> float:
+    """Return the height of the reference surface of the model above that of a scene (m); 0 for generated scenes."""
+    return spec.slab_offset_m - (SLAB_OFFSET_M if find_surface(scene, spec.surface) == "top" else 0.0)
 
 
 def _raise_ground(scene: Scene, offset_m: float) -> Scene:

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from models.layout import Bounds, LayoutSpec
-from models.scene import CATEGORIES, GROUND_CLASSES, VEGETATION, VEHICLES, Grid
+from models.scene import CATEGORIES, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
 from pipelines.runtime import storage
 from pipelines.schema.columns import SCENES
 from pipelines.schema.density_labels import DensityThresholds, classify_density, compute_density_thresholds
@@ -23,6 +23,19 @@ Extremes = dict[str, list[list[float]]]  # Name -> [lowest, highest]; both are l
 # Per source, the surface to which the ground heights refer. "surface" is the surface on which objects stand.
 # "top" is the top of the ground slabs, 0.3 m above that surface.
 SURFACE = {"town": "top", "kitti360": "top"} | dict.fromkeys(("av2", "osm", "opendrive", "own", "py123d"), "surface")
+
+
+def find_surface(scene: Scene, default: str) -> str:
+    """Return the surface to which the ground heights of a scene refer.
+
+    Args:
+        scene: Scene. Edited scenes keep the id of the scene that was edited, which begins with its source.
+        default: Surface of other scenes, such as generated ones.
+
+    Returns:
+        "top" or "surface" (SURFACE).
+    """
+    return SURFACE.get(scene.source) or SURFACE.get(scene.scene_id.partition("-")[0], default)
 
 
 @dataclass(frozen=True)

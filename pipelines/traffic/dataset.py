@@ -15,7 +15,7 @@ from models.scene import Scene
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_tasks
 from pipelines.schema.columns import TRACKS, TRAFFIC, TRAFFIC_TABLES
-from pipelines.schema.dataset import SURFACE
+from pipelines.schema.dataset import find_surface
 from pipelines.schema.run_guard import guard_options
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
@@ -48,18 +48,18 @@ class TrafficRequest:
     slab_offset_m: float | None = None
     control: bool = True
 
-    def find_slab_offset(self, source: str) -> float:
+    def find_slab_offset(self, scene: Scene) -> float:
         """Return the height of the ground rasters above the surface on which objects stand (m).
 
         Args:
-            source: Source of the scene.
+            scene: Scene.
 
         Returns:
             Height (m).
         """
         if self.slab_offset_m is not None:
             return self.slab_offset_m
-        return SLAB_OFFSET_M if SURFACE.get(source, "top") == "top" else 0.0
+        return SLAB_OFFSET_M if find_surface(scene, "top") == "top" else 0.0
 
 
 class Part(NamedTuple):
@@ -167,7 +167,7 @@ def try_scene(
     """
     try:
         scene = close_roads(scene, request.seed) if control else scene
-        offset_m = request.find_slab_offset(scene.source)
+        offset_m = request.find_slab_offset(scene)
         return *simulate_scene(scene, request.demand, request.seed, offset_m), None
     except Exception as error:  # One scene must not stop the others.
         kind = "" if isinstance(error, (ValueError, RuntimeError)) else f"{type(error).__name__}: "

@@ -68,9 +68,11 @@ def test_heights_change_between_reference_surfaces():
     scene = replace(random_scene(0, grid=top.grid), source="osm")
     raised = to_model_surface(scene, top)
     assert np.allclose(raised.height_m, scene.height_m + 0.3 * scene.occupied)
-    assert np.allclose(from_model_surface(raised, "osm", top).height_m, scene.height_m, atol=1e-6)
+    assert np.allclose(from_model_surface(raised, scene, top).height_m, scene.height_m, atol=1e-6)
     for source in ("town", "kitti360", "generated-run"):
         assert to_model_surface(replace(scene, source=source), top).height_m is scene.height_m
+    edited = replace(scene, source="edited-run", scene_id="osm-place-0000000001")
+    assert np.array_equal(to_model_surface(edited, top).height_m, raised.height_m)
     level = replace(top, surface="surface")
     assert to_model_surface(scene, level) is scene
     lowered = to_model_surface(replace(scene, source="town"), level)
