@@ -19,18 +19,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.support.cli import run
-from jobs.support.options import (
-    ConstraintsOption,
-    GpusOption,
-    IfBusyOption,
-    LogFormatOption,
-    ModelOption,
-    WaitForResourcesOption,
-)
+from jobs.support.options import IfBusyOption, LogFormatOption, PipelineOptions
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(PipelineOptions):
     input: str
     """Extract of OpenStreetMap (.osm, .osm.gz, .osm.bz2 or .osm.pbf), or an OpenDRIVE file (.xodr or .xodr.gz)."""
     origin: tuple[float, ...] = ()
@@ -51,16 +44,6 @@ class Config:
     ground; models with other labels need this option)."""
     num_variants: int = 1
     """Number of different results per place."""
-    model: ModelOption = ""
-    seed: int = 0
-    """Random seed."""
-    guidance_scale: float = 1.0
-    """Classifier-free guidance scale; 1 switches guidance off."""
-    constraints: ConstraintsOption = None
-    num_actors: int = 1
-    """Number of pipelines that run in parallel, each on one place; use one per GPU."""
-    gpus: GpusOption = None
-    wait_for_resources_s: WaitForResourcesOption = 0.0
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/furnished)."""
     if_busy: IfBusyOption = "refuse"

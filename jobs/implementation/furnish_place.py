@@ -17,6 +17,9 @@ from models.layout import LayoutSpec
 from pipelines.generation.inpaint import InpaintRequest, RegionConfig, inpaint_scenes
 from pipelines.generation.sample import from_model_surface, load_pipeline
 from pipelines.preprocess.places import PlaceOptions, read_place
+from pipelines.preprocess.sources.opendrive import reader as opendrive
+from pipelines.preprocess.sources.opendrive.file import SUFFIXES
+from pipelines.preprocess.sources.osm import reader as osm
 from pipelines.rendering.render import arrange_contact_sheet, encode_png, render_3d
 from pipelines.runtime import storage
 from pipelines.schema.attribution import find_attribution
@@ -27,7 +30,6 @@ from pipelines.schema.tables import Shard, find_unwritten
 
 EVERYWHERE = RegionConfig(half_plane=(1.0, 0.0, -1e6))
 WIDTH_PX, HEIGHT_PX, AZIMUTH_DEG, ELEVATION_DEG = 800, 600, 30.0, 50.0
-SOURCES = {True: "opendrive", False: "osm"}
 
 
 def list_places(config: Config) -> list[PlaceOptions]:
@@ -49,7 +51,7 @@ def write_maps(config: Config, directory: str, resolution_m: float) -> SceneSubs
     """
     path, places = make_absolute(config.input), list_places(config)
     options = {"file": storage.fingerprint_files([path]), "places": [asdict(place) for place in places]}
-    source = SOURCES[path.endswith((".xodr", ".xodr.gz"))]
+    source = opendrive.SOURCE if path.endswith(SUFFIXES) else osm.SOURCE
     guard_run(directory, source, config.run, options | {"resolution_m": resolution_m})
     shard = Shard(directory, source, "unused", 0)
     if find_unwritten({shard: len(places)}):

@@ -77,14 +77,10 @@ class SceneOptions:
 
 
 @dataclass(frozen=True)
-class GenerationOptions(SceneOptions):
-    """Options for the scenes to change and for the pipeline."""
+class PipelineOptions:
+    """Options for the pipeline and for the actors that run it."""
 
-    max_scenes: int | None = 1
-    """Maximum number of scenes; the first scenes are used."""
     model: ModelOption = ""
-    label: str = ""
-    """Density label of the generated content (default: the label of each scene)."""
     seed: int = 0
     """Random seed."""
     guidance_scale: float = 1.0
@@ -94,6 +90,16 @@ class GenerationOptions(SceneOptions):
     """Number of pipelines that run in parallel; use one per GPU."""
     gpus: GpusOption = None
     wait_for_resources_s: WaitForResourcesOption = 0.0
+
+
+@dataclass(frozen=True)
+class GenerationOptions(PipelineOptions, SceneOptions):
+    """Options for the scenes to change and for the pipeline."""
+
+    max_scenes: int | None = 1
+    """Maximum number of scenes; the first scenes are used."""
+    label: str = ""
+    """Density label of the generated content (default: the label of each scene)."""
 
 
 @dataclass(frozen=True)

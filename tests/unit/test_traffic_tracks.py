@@ -218,8 +218,8 @@ def test_road_users_stand_on_the_ground():
     tracks = make_straight_drive()
     made = put_on_ground(tracks, slope, 0.3)
     assert np.allclose(made.center_m[:, 2], 0.05 * tracks.center_m[:, 0] + 0.75 - 0.3, atol=0.02)
-    beside = put_on_ground(make_straight_drive(y_m=20.0), slope, 0.0)  # The nearest ground is that of the road.
-    assert np.allclose(beside.center_m[:, 2], 0.05 * tracks.center_m[:, 0] + 0.75, atol=0.02)
+    off_road = put_on_ground(make_straight_drive(y_m=20.0), slope, 0.0)  # The nearest ground is that of the road.
+    assert np.allclose(off_road.center_m[:, 2], 0.05 * tracks.center_m[:, 0] + 0.75, atol=0.02)
 
 
 def test_footprint_pixels_are_those_of_the_box():
