@@ -166,6 +166,8 @@ def check_map(config: Osm | OpenDrive) -> None:
 
 
 def check_furnish_place(config: FurnishConfig) -> None:
+    if not storage.exists(make_absolute(config.input)):
+        raise ValueError(f"--input {config.input}: no such file; pass an extract of OpenStreetMap or an OpenDRIVE file")
     require_positive(config, "size_m", "num_variants", "num_actors")
     if config.size_m > MAX_PLACE_M:
         raise ValueError(f"--size-m is {config.size_m:g}, expected at most {MAX_PLACE_M:g}; furnish several places")
