@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from jobs.export_scenes import Config
 from jobs.support.cli import make_absolute
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import select_scenes
-from pipelines.io.export import export_scenes
+from pipelines.io.export import TRAFFIC_WRITERS, WRITERS, export_scenes
 from pipelines.runtime import storage
 
 
@@ -19,15 +21,26 @@ def export(config: Config) -> tuple[str, dict[str, int], dict[str, str]]:
         reason.
     """
     if not config.formats:
-        raise ValueError("--formats is empty, expected one or more of glb, ply, npz, xodr, geojson, geoparquet, usd")
+        raise ValueError(f"--formats is empty, expected one or more of {', '.join((*WRITERS, *TRAFFIC_WRITERS))}")
     selection = select_scenes(config)
+    tracks = make_absolute(config.tracks) if config.tracks else selection.root
+    if not TRAFFIC_WRITERS.keys().isdisjoint(config.formats):
+        missing = [
+            shard for shard, _ in selection.shards() if not storage.exists(replace(shard, root=tracks).path("tracks"))
+        ]
+        if missing:
+            shown = replace(missing[0], root=tracks).path("tracks")
+            raise ValueError(
+                f"{shown}: no such file. The formats animation and xosc need the table tracks of the scenes; write it "
+                "with jobs/simulate_traffic.py, or name its directory with --tracks"
+            )
     output = make_absolute(config.output) if config.output else storage.join_uri(selection.root, "export")
     total = sum(len(rows) for _, rows in selection.shards())
     with hold_output(output, "export", config):
         with JobProgress() as bar:
             shown = bar.add_task("export scenes", total=total)
             made = export_scenes(
-                selection, config.formats, output, config.overwrite, lambda count: bar.advance(shown, count)
+                selection, config.formats, output, config.overwrite, lambda count: bar.advance(shown, count), tracks
             )
         counts, skipped = made
         return output, {str(name): count for name, count in counts.items()}, skipped

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import pyarrow as pa
 
@@ -20,7 +20,8 @@ from pipelines.runtime import storage
 from pipelines.schema.file_names import make_file_name
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, find_shards
-from pipelines.traffic.dataset import TrafficRequest, read_tracks_of_scene, simulate_dataset
+from pipelines.schema.tracks import read_tracks, select_tracks
+from pipelines.traffic.dataset import TrafficRequest, simulate_dataset
 from pipelines.traffic.demand import Demand
 
 SPEED = 4.0  # Speed of moving pictures, compared with real time.
@@ -39,8 +40,9 @@ def write_videos(
     """Write moving pictures of the first scenes with traffic; return a picture of each, and the names of the files."""
     pictures, names = [], []
     for shard, rows in selection.shards():
+        found = read_tracks(replace(shard, root=output))
         for scene in shard.scenes(rows[: count - len(pictures)]):
-            tracks = read_tracks_of_scene(Shard(output, shard.source, shard.split, shard.number), scene.scene_id)
+            tracks = select_tracks(found, scene.scene_id)
             if not len(tracks):
                 continue
             frames = render_traffic(scene, tracks)

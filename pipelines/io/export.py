@@ -1,15 +1,20 @@
-"""Export scenes as GLB, PLY, voxels, OpenDRIVE, GeoJSON, GeoParquet or USD, with one Ray task per shard."""
+"""Export scenes and their traffic to files of other programs, with one Ray task per shard."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Literal
 
+import pyarrow as pa
+
 from models.scene import Scene
+from pipelines.io.animation import export_animation
 from pipelines.io.geojson import export_geojson
 from pipelines.io.geoparquet import export_geoparquet
 from pipelines.io.mesh_export import export_glb, export_ply
 from pipelines.io.opendrive import export_opendrive
+from pipelines.io.openscenario import export_openscenario
 from pipelines.io.usd import export_usd
 from pipelines.io.voxel_import import export_voxels_npz
 from pipelines.runtime import storage
@@ -18,8 +23,9 @@ from pipelines.schema.conversion import make_rejects_table
 from pipelines.schema.file_names import make_file_name
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
+from pipelines.schema.tracks import read_tracks, select_tracks
 
-Format = Literal["glb", "ply", "npz", "xodr", "geojson", "geoparquet", "usd"]
+Format = Literal["glb", "ply", "npz", "xodr", "geojson", "geoparquet", "usd", "animation", "xosc"]
 NOTICE = "NOTICE.txt"  # Licence notices of all exported scenes.
 WRITERS: dict[str, Callable[[Scene], bytes]] = {
     "glb": export_glb,
@@ -30,6 +36,26 @@ WRITERS: dict[str, Callable[[Scene], bytes]] = {
     "geoparquet": export_geoparquet,
     "usd": export_usd,
 }
+EXTENSIONS = {"animation": "glb"}  # Extensions that differ from the name of the format.
+
+
+def export_scenario(scene: Scene, tracks: pa.Table) -> bytes:
+    """Export a scene and its traffic as OpenSCENARIO, with the roads of the format xodr in the same output.
+
+    Args:
+        scene: Scene.
+        tracks: Rows of the table tracks of the scene.
+
+    Returns:
+        Content of the .xosc file.
+    """
+    return export_openscenario(scene, tracks, f"../xodr/{make_file_name(scene.scene_id)}.xodr")
+
+
+TRAFFIC_WRITERS: dict[str, Callable[[Scene, pa.Table], bytes]] = {
+    "animation": export_animation,
+    "xosc": export_scenario,
+}
 
 
 def export_scenes(
@@ -38,12 +64,14 @@ def export_scenes(
     output: str,
     overwrite: bool = False,
     on_scene: Callable[[int], None] | None = None,
+    tracks: str = "",
 ) -> tuple[dict[Format, int], dict[str, str]]:
-    """Export each scene to output/<format>/<scene_id>.<format>; `make_file_name` replaces unsafe letters.
+    """Export each scene to output/<format>/<scene_id>.<extension>; `make_file_name` replaces unsafe letters.
 
     A format may be unable to represent a scene; for example, OpenDRIVE needs roads. If a scene cannot be represented,
     the table `rejects` of the output lists the scene, and the export continues. NOTICE.txt in the output states the
-    licence notices of the scenes. Formats that have a place for it repeat the notice in each file.
+    licence notices of the scenes. Formats that have a place for it repeat the notice in each file. Files of the format
+    xosc refer to files of the format xodr, which are therefore also written.
 
     Args:
         selection: Scenes.
@@ -51,10 +79,13 @@ def export_scenes(
         output: Output directory.
         overwrite: Whether to replace existing files.
         on_scene: Function that is called after each shard, with the number of its scenes.
+        tracks: Dataset directory with the table tracks for the formats animation and xosc (default: that of the
+            scenes).
 
     Returns:
         Number of files per format, and the reason for each scene that was not written.
     """
+    formats = list(dict.fromkeys([*(["xodr"] if "xosc" in formats else []), *formats]))
     parts = selection.shards()
     there = set() if overwrite else list_exported(output, formats)
 
@@ -62,12 +93,18 @@ def export_scenes(
         shard, rows = parts[number]
         written, rejects, paths = [], [], []
         notices: set[str] = set()
+        traffic = None
+        if not TRAFFIC_WRITERS.keys().isdisjoint(formats):
+            traffic = read_tracks(replace(shard, root=tracks or shard.root))
         for scene in shard.scenes(rows):
             for kind in formats:
-                path = storage.join_uri(output, kind, f"{make_file_name(scene.scene_id)}.{kind}")
+                path = storage.join_uri(output, kind, f"{make_file_name(scene.scene_id)}.{find_extension(kind)}")
                 try:
                     if path not in there:
-                        content = WRITERS[kind](scene)
+                        if traffic is not None and kind in TRAFFIC_WRITERS:
+                            content = TRAFFIC_WRITERS[kind](scene, select_tracks(traffic, scene.scene_id))
+                        else:
+                            content = WRITERS[kind](scene)
                         storage.write_whole(path, lambda stream, content=content: stream.write(content))
                     notices |= {scene.attribution} if scene.attribution else set()
                     written.append(kind)
@@ -111,4 +148,20 @@ def list_exported(output: str, formats: Sequence[Format]) -> set[str]:
     Returns:
         Paths of the files.
     """
-    return {path for kind in formats for path in storage.list_files(storage.join_uri(output, kind), f".{kind}")}
+    return {
+        path
+        for kind in formats
+        for path in storage.list_files(storage.join_uri(output, kind), f".{find_extension(kind)}")
+    }
+
+
+def find_extension(kind: str) -> str:
+    """Return the extension of the files of a format.
+
+    Args:
+        kind: Format.
+
+    Returns:
+        Extension without a dot.
+    """
+    return EXTENSIONS.get(kind, kind)

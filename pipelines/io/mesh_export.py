@@ -208,6 +208,19 @@ def export_glb(scene: Scene) -> bytes:
     Returns:
         Content of the .glb file.
     """
+    world = build_world(scene)
+    return trimesh.exchange.gltf.export_glb(world, tree_postprocessor=partial(complete_tree, scene.attribution))
+
+
+def build_world(scene: Scene) -> trimesh.Scene:
+    """Build the nodes and meshes that `export_glb` writes.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        Graph with the node `scene`, and a geometry for the ground and for each category.
+    """
     about = {name: getattr(scene, name) for name in ABOUT} | {"grid": asdict(scene.grid)}
     if scene.attribution:
         about["attribution"] = scene.attribution
@@ -219,16 +232,21 @@ def export_glb(scene: Scene) -> bytes:
         extras = {"classes": {name: f"#{COLOR_HEX[name]}" for name in scene.ground_classes}}
         world.graph.update("ground", "scene", matrix=np.eye(4), geometry="ground", metadata=extras)
     for category in np.unique(scene.category):
-        world.geometry[CATEGORIES[category]] = _make_unit_mesh(category)
+        world.geometry[CATEGORIES[category]] = make_unit_mesh(category)
     for index, transform in enumerate(compute_placements(scene)):
         name = CATEGORIES[scene.category[index]]
         node = f"{name}_{index:04d}"
         world.graph.update(node, "scene", matrix=transform, geometry=name, metadata=_make_extras(scene, index))
-    return trimesh.exchange.gltf.export_glb(world, tree_postprocessor=partial(_complete_tree, scene.attribution))
+    return world
 
 
-def _complete_tree(attribution: str | None, tree: dict) -> None:
-    """Set the licence notice, and hints that tell the GPU whether a buffer view holds vertices or indices."""
+def complete_tree(attribution: str | None, tree: dict) -> None:
+    """Set the licence notice, and hints that tell the GPU whether a buffer view holds vertices or indices.
+
+    Args:
+        attribution: Licence notice, or None.
+        tree: JSON of a glTF file, which is changed.
+    """
     if attribution:
         tree["asset"]["copyright"] = attribution
     for mesh in tree.get("meshes", ()):
@@ -289,7 +307,15 @@ def write_glb(scene: Scene, path: str | Path) -> None:
     os.replace(temporary, path)
 
 
-def _make_unit_mesh(category: int) -> trimesh.Trimesh:
+def make_unit_mesh(category: int) -> trimesh.Trimesh:
+    """Make the mesh of size 1 that the nodes of a category share.
+
+    Args:
+        category: Index of the category.
+
+    Returns:
+        Cuboid or ellipsoid in the colour of the category.
+    """
     visual = trimesh.visual.TextureVisuals(material=_make_material(CATEGORIES[category], CATEGORY_IDS[category]))
     if category != ELLIPSOID:
         return trimesh.Trimesh(*make_unit_cuboid(), visual=visual, process=False)

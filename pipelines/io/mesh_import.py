@@ -107,13 +107,14 @@ def import_glb(
 
 def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     about = _read_metadata(glb.extras)
-    _check_parts(glb.parts, about["ground_classes"])
+    parts = [part for part in glb.parts if "object_id" not in part.extras]  # Traffic is no part of the scene.
+    _check_parts(parts, about["ground_classes"])
     for node, extras in glb.bare:
         if named := {"category", "classes"} & extras.keys():
             raise ValueError(
                 f"node {node} has no mesh, but its extras name {min(named)!r}; delete the node or its extras"
             )
-    nodes = [part for part in glb.parts if "category" in part.extras]
+    nodes = [part for part in parts if "category" in part.extras]
     require_within("scene_primitives", len(nodes))
     letters = find_limit("text_characters")
     fields = [_read_primitive(part.extras, f"the extras of node {part.node}") for part in nodes]
@@ -151,7 +152,7 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     rotation, size_m = canonicalize_boxes(rotation, size_m)
     turned = ~np.isclose(compute_yaw(rotation), yaw_said, rtol=0, atol=UNMOVED)
 
-    ground = [part for part in glb.parts if "classes" in part.extras]
+    ground = [part for part in parts if "classes" in part.extras]
     vertices_m = _join_meshes(place_parts(ground), (0, 3)) @ scene_from_gltf[:3, :3].T
     ids = np.array([GROUND_CLASS_ID[name] for name in about["ground_classes"]])
     class_id, off = find_nearest_class(_join_meshes([part.local.color for part in ground], (0, 3)), True, ids)

@@ -16,6 +16,7 @@ from scipy import ndimage
 from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.geometry.masks import find_nearest_true
 from pipelines.schema.palette import CATEGORY_CLASS_ID, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
+from pipelines.schema.tracks import list_road_users
 
 NODES = 65  # Number of ground heights along the longer side. In a crop, the spacing is 1 m.
 OVERVIEW_NODES = 17
@@ -65,17 +66,16 @@ def export_web_tracks(tracks: pa.Table) -> list[dict]:
         One dictionary per road user, with the keys category, color, size_m, time_s (of each place) and places: x, y and
         z of the centre (m) and yaw (radians).
     """
-    rows = np.stack([tracks[name].to_numpy() for name in ("x_m", "y_m", "z_m", "yaw_rad")], axis=1)
-    size_m = np.stack([tracks[name].to_numpy() for name in ("length_m", "width_m", "height_m")], axis=1)
-    time_s, number, names = tracks["time_s"].to_numpy(), tracks["object_id"].to_numpy(), tracks["category"].to_pylist()
-    found = []
-    for part in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(number)) + 1):
-        if len(part):
-            about = {"category": names[part[0]], "color": COLOR_HEX[names[part[0]]]}
-            sizes = np.round(size_m[part[0]].astype(float), 3).tolist()
-            places = np.round(rows[part].astype(float), 3).tolist()
-            found.append(about | {"size_m": sizes, "time_s": time_s[part].astype(float).tolist(), "places": places})
-    return found
+    return [
+        {
+            "category": user.category,
+            "color": COLOR_HEX[user.category],
+            "size_m": np.round(user.size_m.astype(float), 3).tolist(),
+            "time_s": user.time_s.astype(float).tolist(),
+            "places": np.round(np.column_stack([user.center_m, user.yaw_rad]).astype(float), 3).tolist(),
+        }
+        for user in list_road_users(tracks)
+    ]
 
 
 def export_ground(scene: Scene) -> dict:

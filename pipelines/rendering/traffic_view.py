@@ -6,10 +6,11 @@ import numpy as np
 import pyarrow as pa
 from PIL import Image, ImageDraw
 
-from models.scene import CATEGORY_INDEX, VEHICLES, Scene
+from models.scene import CATEGORY_INDEX, Scene
+from pipelines.geometry.parked_vehicles import find_driving_vehicles
 from pipelines.rendering.render import render_bev
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS
-from pipelines.traffic.obstacles import find_parked_vehicles, make_footprints
+from pipelines.traffic.obstacles import make_footprints
 
 SUPERSAMPLE = 2
 MOVING = (255, 220, 60)  # Colour of moving vehicles.
@@ -29,8 +30,7 @@ def render_traffic(scene: Scene, tracks: pa.Table, size_px: int = 512, duration_
     Returns:
         One image (H, W, 3) uint8 per time.
     """
-    driving = np.isin(scene.category, VEHICLES) & ~find_parked_vehicles(scene)
-    ground = Image.fromarray(render_bev(scene.select(~driving), SUPERSAMPLE * size_px))
+    ground = Image.fromarray(render_bev(scene.select(~find_driving_vehicles(scene)), SUPERSAMPLE * size_px))
     scale = max(ground.size) / (max(scene.grid.rows, scene.grid.cols) * scene.grid.resolution_m)
     table = {name: tracks[name].to_numpy() for name in ("time_s", "x_m", "y_m", "yaw_rad", "length_m", "width_m")}
     categories = np.array(tracks["category"].to_pylist())

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from models.composition.extend import inpaint_blocks, split_region
 from models.composition.inpaint import select_polygon
 from models.labels import LABELS, require_labels
-from models.scene import VEHICLES, Grid, Scene
+from models.scene import Grid, Scene
 from pipelines.editing.edit import Duplicate, parse_edits, replay_edits, serialize_edits
 from pipelines.generation.sample import (
     find_scene_label,
@@ -23,6 +23,7 @@ from pipelines.generation.sample import (
     resample_to_model_resolution,
     to_model_surface,
 )
+from pipelines.geometry.parked_vehicles import find_driving_vehicles
 from pipelines.io.mesh_export import export_glb
 from pipelines.io.opendrive import export_opendrive
 from pipelines.io.web_export import export_ground, export_web_scene, export_web_tracks
@@ -33,6 +34,7 @@ from pipelines.runtime import storage
 from pipelines.schema.conversion import parse_scenes
 from pipelines.schema.file_names import make_file_name
 from pipelines.schema.tables import Shard
+from pipelines.schema.tracks import read_tracks, select_tracks
 from pipelines.studio.limits import StudioError, StudioLimits
 from pipelines.studio.requests import (
     EditsRequest,
@@ -45,8 +47,6 @@ from pipelines.studio.requests import (
 )
 from pipelines.studio.sessions import Session, SessionStore
 from pipelines.studio.tasks import BackgroundTask, TaskQueue
-from pipelines.traffic.dataset import read_tracks_of_scene
-from pipelines.traffic.obstacles import find_parked_vehicles
 
 MAX_SIDE_M = 512.0  # Maximum side length of an extended scene (m).
 THUMBNAIL_PX, SCENES_PER_PAGE = 128, 24
@@ -397,12 +397,12 @@ class Studio:
         if not storage.exists(shard.path("tracks")):
             return {"objects": [], "driving": []}
         try:
-            tracks = read_tracks_of_scene(shard, scene.scene_id)
+            tracks = select_tracks(read_tracks(shard), scene.scene_id)
         except ValueError as error:
             logger.warning("studio: no traffic of scene %r: %s", scene.scene_id, error)
             raise StudioError("the tracks of this scene are damaged; the log of the studio names the file") from error
-        driving = np.isin(scene.category, VEHICLES) & ~find_parked_vehicles(scene)
-        return {"objects": export_web_tracks(tracks), "driving": np.flatnonzero(driving).tolist()}
+        driving = np.flatnonzero(find_driving_vehicles(scene))
+        return {"objects": export_web_tracks(tracks), "driving": driving.tolist()}
 
     def find_scene(self, scene_id: str) -> tuple[Catalogue, int] | None:
         """Return the catalogue and the index of a scene of the datasets; None if there is no such scene."""

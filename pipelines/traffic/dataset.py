@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as compute
 
 from models.layout import SLAB_OFFSET_M
 from models.scene import Scene
@@ -25,7 +24,6 @@ from pipelines.traffic.simulation import TrafficHealth, simulate_scene
 from pipelines.traffic.sumo import check_sumo, require_sumo
 from pipelines.traffic.tracks import Tracks
 
-pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
 PART_SCENES = 2  # Number of scenes per task.
 
 
@@ -261,20 +259,3 @@ def is_written(shard: Shard, rows: Sequence[int], request: TrafficRequest) -> bo
         return storage.read_num_rows(shard.path("traffic")) == len(rows) * (2 if request.control else 1)
     except ValueError:
         return False
-
-
-def read_tracks_of_scene(shard: Shard, scene_id: str) -> pa.Table:
-    """Return the trajectories of a scene.
-
-    Args:
-        shard: Shard of the table tracks.
-        scene_id: Name of the scene.
-
-    Returns:
-        Rows of the table tracks.
-
-    Raises:
-        ValueError: The file is missing or damaged.
-    """
-    table = shard.read("tracks", encoded=("scene_id", "category"))  # Plain texts would need much memory.
-    return table.filter(pc.equal(table["scene_id"].cast(pa.string()), scene_id))

@@ -11,7 +11,8 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
 from models.scene import Scene
-from pipelines.traffic.obstacles import select_footprints, select_road
+from pipelines.geometry.parked_vehicles import select_road
+from pipelines.traffic.obstacles import select_footprints
 from pipelines.traffic.tracks import Tracks
 
 LARGEST_M = 1.8  # Largest displacement.

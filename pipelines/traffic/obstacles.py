@@ -9,41 +9,12 @@ import shapely
 from scipy.ndimage import binary_opening, distance_transform_edt
 from skimage.draw import polygon
 
-from models.scene import ROAD_CLASSES, VEHICLES, Scene
+from models.scene import ROAD_CLASSES, Scene
+from pipelines.geometry.parked_vehicles import select_road
 
-KERB_M = 1.6  # A vehicle whose centre is at most this far from the border of the road is parked.
 CLEARANCE_M = 0.1  # Distance that moving vehicles keep from parked ones.
 GAP_M = 2.0  # Narrower gaps between parked vehicles are not part of the free road.
 CLOSURES, CLOSURE_M = 4, 10.0  # Number and radius of the circles without road in the control (m).
-
-
-def select_road(scene: Scene) -> np.ndarray:
-    """Select the road of a scene.
-
-    Args:
-        scene: Scene.
-
-    Returns:
-        (rows, cols) bool.
-    """
-    names = [k for k, name in enumerate(scene.ground_classes) if name in ROAD_CLASSES]
-    return np.any(scene.occupied[names], axis=0)
-
-
-def find_parked_vehicles(scene: Scene) -> np.ndarray:
-    """Find the vehicles that stand outside of the road or at its border.
-
-    Args:
-        scene: Scene.
-
-    Returns:
-        (n,) bool. Other vehicles are in traffic.
-    """
-    # Beyond the border of the scene, the road continues.
-    depth_m = np.asarray(distance_transform_edt(np.pad(select_road(scene), 16, mode="edge"))) * scene.grid.resolution_m
-    row, col = scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
-    row, col = np.clip(row, 0, scene.grid.rows - 1), np.clip(col, 0, scene.grid.cols - 1)
-    return np.isin(scene.category, VEHICLES) & (depth_m[row + 16, col + 16] <= KERB_M)
 
 
 def remove_occupied_road(scene: Scene, parked: np.ndarray) -> Scene:

@@ -12,10 +12,11 @@ from scipy.ndimage import map_coordinates
 
 from models.scene import CATEGORY_INDEX, VEHICLES, Scene
 from pipelines.geometry.masks import find_nearest_true
+from pipelines.geometry.parked_vehicles import find_parked_vehicles
 from pipelines.traffic.demand import KINDS, Demand, Routes, make_routes
 from pipelines.traffic.lateral import swerve
 from pipelines.traffic.network import Network, build_network
-from pipelines.traffic.obstacles import find_contacts, find_parked_vehicles, make_footprints, remove_occupied_road
+from pipelines.traffic.obstacles import find_contacts, make_footprints, remove_occupied_road
 from pipelines.traffic.sumo import read_float, read_xml, require_sumo, run_program
 from pipelines.traffic.tracks import Tracks
 

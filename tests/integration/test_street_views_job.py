@@ -1,6 +1,7 @@
 """Tests of the jobs for street views and exports, on Ray."""
 
 import json
+import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +13,24 @@ from PIL import Image
 from models.scene import Scene
 from pipelines.io.mesh_export import GROUND, build_painted_ground, triangulate_scene
 from pipelines.preprocess.sources.town.generator import generate_town
+from pipelines.runtime import storage
 from pipelines.schema.palette import CATEGORY_IDS
 from pipelines.schema.tables import Shard
+from pipelines.traffic.dataset import make_tracks_table
+from pipelines.traffic.tracks import Tracks
 
 
 @pytest.fixture(scope="module")
 def town_scenes() -> list[Scene]:
     return [generate_town(seed).scene(k, "test") for seed, k in ((3, 20), (4, 20), (8, 10))]
+
+
+def make_tracks() -> Tracks:
+    """Return two cars that drive ahead for 4 s."""
+    time_s = np.tile(np.arange(5.0), 2)
+    number = np.repeat([0, 1], 5)
+    center_m = np.stack([5.0 + 8.0 * time_s, 4.0 * number, np.zeros(10)], axis=1)
+    return Tracks(number, np.full(10, "car"), time_s, center_m, np.zeros(10), np.full(10, 8.0))
 
 
 def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluster):
@@ -57,6 +69,19 @@ def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluste
     output, counts, refused = export(ExportConfig(str(tmp_path), formats=("glb", "ply", "npz", "xodr", "geojson")))
     assert counts == {"glb": 2, "ply": 2, "npz": 2, "xodr": 1, "geojson": 2}
     assert list(refused) == ["bare"] and refused["bare"].startswith("xodr: scene bare has no road")
+    with pytest.raises(ValueError, match=r"tracks.*no such file.*jobs/simulate_traffic.py, or name its directory"):
+        export(ExportConfig(str(tmp_path), formats=("animation",)))
+    traffic = make_tracks_table(town_scenes[0].scene_id, make_tracks())
+    storage.write_parquet(traffic, Shard(str(tmp_path / "simulated"), "town", "test", 0).path("tracks"))
+    config = ExportConfig(str(tmp_path), formats=("xosc", "animation"), tracks=str(tmp_path / "simulated"))
+    _, counts, refused = export(config)
+    assert counts == {"xodr": 1, "xosc": 1, "animation": 1}
+    assert refused["bare"] == "animation: scene bare has no traffic to export"
+    scenario = ElementTree.parse(Path(output) / "xosc" / f"{town_scenes[0].scene_id}.xosc")
+    roads = scenario.find("RoadNetwork/LogicFile").get("filepath")
+    assert ElementTree.parse(Path(output) / "xosc" / roads).getroot().tag == "OpenDRIVE"
+    assert sum(e.get("name").startswith("road_user") for e in scenario.iter("ScenarioObject")) == 2
+    assert (Path(output) / "animation" / f"{town_scenes[0].scene_id}.glb").stat().st_size > 10_000
     path = Path(output)
     mesh = trimesh.load(path / "ply" / f"{town_scenes[0].scene_id}.ply", process=False)
     soup = triangulate_scene(town_scenes[0])

@@ -13,6 +13,7 @@ import shapely
 from helpers import ROOT, make_straight_drive, random_scene
 
 from models.scene import CATEGORY_INDEX, Grid, Scene, make_yaw_rotation
+from pipelines.geometry.parked_vehicles import find_parked_vehicles, select_road
 from pipelines.io.web_export import export_web_tracks
 from pipelines.preprocess.sources.town.version2.town import make_large_crops
 from pipelines.rendering.traffic_view import render_traffic
@@ -28,11 +29,9 @@ from pipelines.traffic.network import Network, read_network
 from pipelines.traffic.obstacles import (
     close_roads,
     find_contacts,
-    find_parked_vehicles,
     make_footprints,
     remove_occupied_road,
     select_footprints,
-    select_road,
 )
 from pipelines.traffic.simulation import measure_health, put_on_ground, read_tracks, simulate_scene
 from pipelines.traffic.sumo import find_sumo
