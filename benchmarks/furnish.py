@@ -25,14 +25,14 @@ from models.composition.extend import inpaint_blocks
 from models.pipeline import PrITTIPipeline
 from models.pretrained import find_pipeline_path
 from models.scene import CATEGORIES, Scene
-from pipelines.generation.sample import resample_to_model_grid, to_model_surface
+from pipelines.generation.sample import resample_to_model_grid
 from pipelines.metrics.controls import damage_scene
 from pipelines.metrics.distributions import compute_jensen_shannon, normalize_histogram
 from pipelines.metrics.intervals import Estimate, compute_weights, make_estimate
 from pipelines.metrics.relations import RELATION_HISTOGRAMS, compute_scene_relations
 from pipelines.preprocess.sources.osm.reader import OsmOptions, read_drive
 from pipelines.preprocess.sources.town.generator import generate_town
-from pipelines.schema.dataset import SURFACE
+from pipelines.schema.ground_surface import SURFACE, to_model_surface
 
 KEPT = ("construction_big", "construction_small")
 GENERATED = tuple(name for name in CATEGORIES if name not in KEPT)

@@ -5,6 +5,7 @@
     jobs/train_dit.py smoke                 seconds; generates its own data, layout VAE and latents
     jobs/train_dit.py kitti360-xl --dataset DIR --label-kind joint --num-workers 8
     jobs/train_dit.py town --start-from town --label-kind partial --learning-rate 4e-4      continue with the weights
+    jobs/train_dit.py town --add-datasets OSM --dataset-weights 2 1      mix datasets that one layout VAE encoded
 
 The job writes a complete pipeline to $PRITTI_HOME/models/pritti-<preset>. The job logs losses and sampled scenes to
 MLflow ($MLFLOW_TRACKING_URI, by default an sqlite file under $PRITTI_HOME). Run the same command again to resume.
@@ -18,7 +19,14 @@ from typing import Literal
 import tyro
 
 from jobs.support.cli import run
-from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, WaitForResourcesOption
+from jobs.support.options import (
+    AddDatasetsOption,
+    DatasetWeightsOption,
+    GpusOption,
+    IfBusyOption,
+    LogFormatOption,
+    WaitForResourcesOption,
+)
 
 
 @dataclass(frozen=True)
@@ -29,8 +37,13 @@ class Config:
     """Preset: smoke, demo, town, kitti360-mini, kitti360, kitti360-l, kitti360-xl or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
+    add_datasets: AddDatasetsOption = ()
+    dataset_weights: DatasetWeightsOption = ()
     latents: str = ""
     """Directory with latents.json (default: the dataset directory)."""
+    add_latents: tuple[str, ...] = ()
+    """Directories with latents.json of --add-datasets, encoded by the same layout VAE (default: the dataset
+    directories)."""
     label_kind: Literal["vegetation", "vehicle", "joint", "partial", "none"] | None = None
     """Kind of label that the model is conditioned on (default: as in the paper, vegetation density, or vehicle density
     if the dataset has no vegetation, such as Argoverse 2). joint: both. partial: both, either alone or none, and

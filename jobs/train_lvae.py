@@ -5,6 +5,7 @@
     jobs/train_lvae.py smoke                seconds; generates its own data
     jobs/train_lvae.py kitti360 --dataset DIR --num-workers 4
     jobs/train_lvae.py kitti360-mini --dataset DIR --start-from MODEL --name longer     continue with trained weights
+    jobs/train_lvae.py town --add-datasets OSM KITTI-360 --dataset-weights 2 1 1     mix three datasets
     jobs/train_lvae.py demo --train-object-decoder-of town --name lvae-decoder     a new object decoder for a pipeline
 
 --train-object-decoder-of keeps the encoders and the ground decoder of a pipeline. The latents do not change, so the
@@ -23,7 +24,14 @@ from typing import Literal
 import tyro
 
 from jobs.support.cli import run
-from jobs.support.options import GpusOption, IfBusyOption, LogFormatOption, WaitForResourcesOption
+from jobs.support.options import (
+    AddDatasetsOption,
+    DatasetWeightsOption,
+    GpusOption,
+    IfBusyOption,
+    LogFormatOption,
+    WaitForResourcesOption,
+)
 
 
 @dataclass(frozen=True)
@@ -34,6 +42,8 @@ class Config:
     """Preset: smoke, demo, town, town-pixels, kitti360, kitti360-mini, kitti360-light or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
+    add_datasets: AddDatasetsOption = ()
+    dataset_weights: DatasetWeightsOption = ()
     name: str = ""
     """Name of the run; a run name is bound to its options (default: lvae-<preset>)."""
     output: str = ""

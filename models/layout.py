@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -213,6 +214,97 @@ class LayoutSpec:
     def fingerprint(self) -> str:
         """Return the first twelve hexadecimal digits of the SHA-256 digest of the spec."""
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()[:12]
+
+    @staticmethod
+    def merge(specs: Sequence[LayoutSpec]) -> LayoutSpec:
+        """Return the layout that covers the scenes of several data sets.
+
+        Args:
+            specs: Layouts of the data sets. The grid and the reference surface of the first are kept.
+
+        Returns:
+            Layout with the categories and ground classes of all, the largest number of slots per category and the
+            widest bounds.
+
+        Raises:
+            ValueError: The grids cover different areas.
+        """
+        first = specs[0]
+        for number, spec in enumerate(specs[1:], 1):
+            first.require_same_area(spec, f"data set {number + 1}")
+
+        def widest(name: str) -> Bounds:
+            # Heights of another reference surface move with it.
+            shift = [first.slab_offset_m - spec.slab_offset_m if name == "height_bounds_m" else 0.0 for spec in specs]
+            parts = [getattr(spec, name) for spec in specs]
+            low = np.min([np.add(part.low, by) for part, by in zip(parts, shift, strict=True)], axis=0)
+            high = np.max([np.add(part.high, by) for part, by in zip(parts, shift, strict=True)], axis=0)
+            return Bounds(tuple(low.tolist()), tuple(high.tolist()))
+
+        slots = {
+            name: max(dict(zip(spec.categories, spec.slots, strict=True)).get(name, -1) for spec in specs)
+            for name in CATEGORIES
+        }
+        classes = {name for spec in specs for name in spec.ground_classes}
+        return replace(
+            first,
+            categories=tuple(name for name, count in slots.items() if count >= 0),
+            slots=tuple(count for count in slots.values() if count >= 0),
+            ground_classes=tuple(name for name in GROUND_CLASSES if name in classes),
+            **{name: widest(name) for name in NUM_BOUNDS},
+        )
+
+    def require_same_area(self, other: LayoutSpec, what: str) -> None:
+        """Raise an error if the grid of another spec covers another area.
+
+        Args:
+            other: Spec to compare.
+            what: Name of the owner of `other` for the error message.
+
+        Raises:
+            ValueError: The areas differ.
+        """
+        mine, theirs = ((g.front_m, g.left_m, g.back_m, g.right_m) for g in (self.grid, other.grid))
+        if not np.allclose(mine, theirs):
+            raise ValueError(
+                f"{what} covers x from {theirs[2]:g} to {theirs[0]:g} m and y from {theirs[3]:g} to {theirs[1]:g} m, "
+                f"expected {mine[2]:g} to {mine[0]:g} m and {mine[3]:g} to {mine[1]:g} m"
+            )
+
+    def require_cover(self, other: LayoutSpec, what: str) -> list[str]:
+        """Raise an error if this layout has no place for the scenes of another one.
+
+        Args:
+            other: Layout of a data set.
+            what: Name of the data set for messages.
+
+        Returns:
+            Notes: values of the data set that this layout clips or leaves out.
+
+        Raises:
+            ValueError: A category or a ground class is missing, or the grids cover different areas.
+        """
+        self.require_same_area(other, what)
+        for name in ("categories", "ground_classes"):
+            if missing := [one for one in getattr(other, name) if one not in getattr(self, name)]:
+                raise ValueError(
+                    f"{what} has the {name} {', '.join(missing)}, which the layout of the model lacks; use a model "
+                    "that was trained on such data"
+                )
+        notes = []
+        own = dict(zip(self.categories, self.slots, strict=True))
+        if fewer := [name for name, count in zip(other.categories, other.slots, strict=True) if own[name] < count]:
+            notes.append(f"{what} has slots for more objects of {', '.join(fewer)}: the farthest ones are left out")
+        shift = self.slab_offset_m - other.slab_offset_m
+        for name, by, meaning in (("height_bounds_m", shift, "ground heights"), ("center_bounds_m", 0.0, "centres")):
+            mine, theirs = getattr(self, name), getattr(other, name)
+            low, high = theirs.low[-1] + by, theirs.high[-1] + by
+            if low < mine.low[-1] or high > mine.high[-1]:
+                notes.append(
+                    f"{what} has z of {meaning} from {low:.3g} to {high:.3g} m, but the bounds of the layout are "
+                    f"{mine.low[-1]:.3g} to {mine.high[-1]:.3g} m"
+                )
+        return notes
 
     def require(self, other: LayoutSpec, what: str) -> None:
         """Raise an error if another spec differs from this one.

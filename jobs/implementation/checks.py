@@ -27,6 +27,7 @@ from models.presets import DIT_PRESETS, LVAE_PRESETS, STREET_PLANNER_PRESETS, fi
 from models.scene import CATEGORIES, VEGETATION, VEHICLES
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
+from pipelines.schema.mixture import Mixture
 
 MAX_PLACE_M = 1024.0
 MAX_TRAFFIC_S, MAX_ROAD_USERS = 3600.0, 2000
@@ -38,6 +39,12 @@ def find_training_dataset(config: LVAEConfig | DiTConfig, source: str) -> str:
     if config.dataset:
         return make_absolute(config.dataset)
     return home_path("datasets", "smoke" if config.preset == "smoke" else source)
+
+
+def open_mixture(config: LVAEConfig | DiTConfig, source: str) -> Mixture:
+    """Open --dataset, or the dataset of the preset, and --add-datasets."""
+    added = [make_absolute(root) for root in config.add_datasets]
+    return Mixture.open([find_training_dataset(config, source), *added], config.dataset_weights)
 
 
 def needs_smoke_inputs(config: LVAEConfig | DiTConfig) -> bool:
@@ -57,7 +64,7 @@ def check_train_lvae(config: LVAEConfig) -> None:
     if config.start_from:
         find_start(config.start_from)
     if not needs_smoke_inputs(config):
-        Dataset.open(find_training_dataset(config, row.source))
+        open_mixture(config, row.source)
 
 
 def find_start(model: str) -> tuple[str, bool]:
@@ -79,9 +86,9 @@ def check_train_dit(config: DiTConfig) -> None:
     row = find_preset(DIT_PRESETS, config.preset)
     require_positive(config, "gradient_accumulation_steps")
     if not needs_smoke_inputs(config):
-        dataset = Dataset.open(find_training_dataset(config, LVAE_PRESETS[row.lvae].source))
-        resolve_label_kind(config, dataset)
-        require_latents(make_absolute(config.latents) if config.latents else dataset.root, dataset.root)
+        mixture = open_mixture(config, LVAE_PRESETS[row.lvae].source)
+        resolve_label_kind(config, mixture.datasets[0])
+        find_latents(config, mixture)
 
 
 def check_train_street_planner(config: StreetPlannerConfig) -> None:
@@ -113,6 +120,32 @@ def resolve_label_kind(config: DiTConfig, dataset: Dataset) -> str:
             f" scenes would have the same label; use --label-kind {' or '.join(known)}"
         )
     return kind
+
+
+def find_latents(config: DiTConfig, mixture: Mixture) -> list[str]:
+    """Return the directory of the latents of each dataset.
+
+    Raises:
+        ValueError: Latents are missing or incomplete, or come from different layout VAEs.
+    """
+    if config.add_latents and len(config.add_latents) != len(config.add_datasets):
+        raise ValueError(
+            f"--add-latents has {len(config.add_latents)} directories, expected one for each of the "
+            f"{len(config.add_datasets)} of --add-datasets"
+        )
+    given = [config.latents, *(config.add_latents or [""] * len(config.add_datasets))]
+    roots = [dataset.root for dataset in mixture.datasets]
+    found = [make_absolute(one) if one else root for one, root in zip(given, roots, strict=True)]
+    digests = []
+    for latents, root in zip(found, roots, strict=True):
+        require_latents(latents, root)
+        digests.append(storage.read_json(storage.join_uri(latents, "latents.json"))["lvae_digest"])
+        if digests[-1] != digests[0]:
+            raise ValueError(
+                f"{latents} holds latents of another layout VAE than {found[0]}; encode {root} with that layout VAE,"
+                " and name the directory with --add-latents"
+            )
+    return found
 
 
 def require_latents(latents_root: str, dataset_root: str) -> None:

@@ -15,7 +15,7 @@ from jobs.support.progress import JobProgress
 from models.labels import ANY, mark_free
 from models.layout import LayoutSpec
 from pipelines.generation.inpaint import InpaintRequest, RegionConfig, inpaint_scenes
-from pipelines.generation.sample import from_model_surface, load_pipeline
+from pipelines.generation.sample import load_pipeline
 from pipelines.preprocess.places import PlaceOptions, read_place
 from pipelines.preprocess.sources.opendrive import reader as opendrive
 from pipelines.preprocess.sources.opendrive.file import SUFFIXES
@@ -24,6 +24,7 @@ from pipelines.rendering.render import arrange_contact_sheet, encode_png, render
 from pipelines.runtime import storage
 from pipelines.schema.attribution import find_attribution
 from pipelines.schema.file_names import make_file_name
+from pipelines.schema.ground_surface import from_model_surface
 from pipelines.schema.run_guard import guard_run
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, find_unwritten

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import pyarrow as pa
 import torch
 from torch import Tensor
 
 from jobs.encode_latents import Config as EncodeConfig
 from jobs.implementation.checks import (
+    find_latents,
     find_training_dataset,
     needs_smoke_inputs,
-    require_latents,
+    open_mixture,
     resolve_label_kind,
 )
 from jobs.implementation.encode_latents import encode
@@ -23,7 +23,7 @@ from jobs.implementation.smoke_inputs import make_smoke_dataset
 from jobs.implementation.train_lvae import train as train_lvae
 from jobs.support import trainer
 from jobs.support.callbacks import SamplingCheck
-from jobs.support.cli import home_path, make_absolute, resolve_path
+from jobs.support.cli import home_path, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.model_files import write_pipeline
 from jobs.support.outputs import hold_training
@@ -49,10 +49,11 @@ from models.training import (
 )
 from pipelines.generation.sample import load_pipeline
 from pipelines.runtime import storage
-from pipelines.schema.dataset import Dataset
+from pipelines.schema.mixture import Mixture
 from pipelines.schema.tables import Shard, find_shards
-from pipelines.training.data_loader import LABEL_COLUMNS, LatentReader, Stream, label_indices, repeat_crops
+from pipelines.training.data_loader import LatentReader, Stream, Thresholds, read_label_indices, repeat_crops
 from pipelines.training.latents import digest_weights, load_lvae
+from pipelines.training.mixed_stream import mix_streams
 
 
 def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
@@ -66,22 +67,26 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     if needs_smoke_inputs(config):
         make_smoke_dataset(root)
         make_smoke_latents(root)
-    dataset = Dataset.open(root)
+    mixture = open_mixture(config, LVAE_PRESETS[row.lvae].source)
+    dataset = mixture.datasets[0]
     label_kind = resolve_label_kind(config, dataset)
-    latents_root = make_absolute(config.latents) if config.latents else root
-    require_latents(latents_root, root)
-    latents = storage.read_json(storage.join_uri(latents_root, "latents.json"))
-    if row.known_streets_share and not latents.get("streets"):
-        raise ValueError(
-            f"--known-streets-share {row.known_streets_share}: {latents_root} has no latents of streets; run"
-            f" jobs/encode_latents.py --streets --dataset {root} --output {latents_root}"
-        )
+    latents_roots = find_latents(config, mixture)
+    latents_root = latents_roots[0]
+    encoded = [storage.read_json(storage.join_uri(one, "latents.json")) for one in latents_roots]
+    latents = mix_statistics(encoded, mixture)
+    for one, place, found in zip(mixture.datasets, latents_roots, encoded, strict=True):
+        if row.known_streets_share and not found.get("streets"):
+            raise ValueError(
+                f"--known-streets-share {row.known_streets_share}: {place} has no latents of streets; run"
+                f" jobs/encode_latents.py --streets --dataset {one.root} --output {place}"
+            )
     architecture = make_dit_architecture(row, latents, load_encoder(latents, latents_root), label_kind)
     start = load_start(config.start_from, latents["lvae_digest"], architecture) if config.start_from else None
     architecture |= start.inherited if start else {}
     other = load_other(config.average_with, latents["lvae_digest"], architecture) if config.average_with else None
     settings = make_optimizer_config(config, row)
     identity = make_run_identity(config, row, settings, latents, root, start) | {"label": label_kind}
+    identity |= mixture.identity()
     if other:
         identity |= {"average_with": other.digest}
     name = find_run_name(config)
@@ -89,9 +94,11 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
     execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
     loss_config = make_loss_config(config, row)
-    shards = find_shards(root, source=dataset.source, split="train")
-    stream = make_stream(config, shards, row.batch_size)
-    check_training_labels(shards, label_kind)
+    shards = [find_shards(one.root, source=one.source, split="train") for one in mixture.datasets]
+    stream = mix_streams(make_streams(config, shards, row.batch_size), mixture.weights)
+    thresholds = (dataset.vegetation, dataset.vehicle) if config.add_datasets else None
+    check_training_labels(stream.shards, label_kind, thresholds)
+    added = {one.root: latents for one, latents in zip(mixture.datasets, latents_roots, strict=True)}
     training = TrainingRun(
         name=name,
         average_with=other.state if other else None,
@@ -99,7 +106,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
         storage_path=home_path("runs"),
         build=partial(build, architecture, settings, execution, row.label_dropout, start, loss_config),
         stream=stream,
-        reader=LatentReader(latents_root, label_kind, row.known_streets_share > 0),
+        reader=LatentReader(latents_root, label_kind, row.known_streets_share > 0, added, thresholds),
         settings=settings,
         identity=identity,
         tracker=tracker,
@@ -113,35 +120,48 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     return training, partial(complete_pipeline, latents["lvae"], sampling)
 
 
-def make_stream(config: Config, shards: list[Shard], batch_size: int) -> Stream:
-    """Return the order of the training samples, with --crop-repeats.
+def mix_statistics(latents: list[dict], mixture: Mixture) -> dict:
+    """Return the latents.json of the first dataset, with the channel statistics of the samples of the mixture."""
+    if len(latents) == 1:
+        return latents[0]
+    shares = np.array(mixture.weights) / sum(mixture.weights)
+    mean, std = (np.array([one[name] for one in latents]) for name in ("channel_mean", "channel_std"))
+    mixed = shares @ mean
+    variance = shares @ (std**2 + mean**2) - mixed**2
+    return latents[0] | {"channel_mean": mixed.tolist(), "channel_std": np.sqrt(np.maximum(variance, 1e-12)).tolist()}
+
+
+def make_streams(config: Config, shards: Sequence[Sequence[Shard]], batch_size: int) -> list[Stream]:
+    """Return the order of the training samples of each dataset, with --crop-repeats.
 
     Raises:
-        ValueError: --crop-repeats is below 1, or is above 1 although the dataset has no crops.
+        ValueError: --crop-repeats is below 1, or is above 1 although no dataset has crops.
     """
-    scenes = [shard.read("scenes", ["free_pose"]) for shard in shards]
-    counts = tuple(table.num_rows for table in scenes)
     if config.crop_repeats < 1:
         raise ValueError(f"--crop-repeats {config.crop_repeats}: use 1 or more")
-    if config.crop_repeats == 1:
-        return Stream(tuple(shards), counts, batch_size, config.seed)
-    rows = tuple(repeat_crops(table, config.crop_repeats) for table in scenes)
-    repeated = tuple(map(len, rows))
-    if repeated == counts:
+    streams, crops = [], False
+    for part in shards:
+        scenes = [shard.read("scenes", ["free_pose"]) for shard in part]
+        counts = tuple(table.num_rows for table in scenes)
+        rows = tuple(repeat_crops(table, config.crop_repeats) for table in scenes) if config.crop_repeats > 1 else ()
+        repeated = tuple(map(len, rows)) or counts
+        crops = crops or repeated != counts
+        streams.append(Stream(tuple(part), repeated, batch_size, config.seed, rows))
+    if config.crop_repeats > 1 and not crops:
         raise ValueError(
             f"--crop-repeats {config.crop_repeats}: the dataset has no crops at any place; omit the option"
         )
-    return Stream(tuple(shards), repeated, batch_size, config.seed, rows)
+    return streams
 
 
-def check_training_labels(shards: list[Shard], kind: str) -> None:
+def check_training_labels(shards: Sequence[Shard], kind: str, thresholds: Thresholds = None) -> None:
     """Check that the training scenes differ in their labels, and print the labels that no scene has.
 
     Raises:
         ValueError: All scenes have the same label although this kind has several.
     """
-    tables = [shard.read("scenes", list(LABEL_COLUMNS)) for shard in shards]
-    counts = np.bincount(label_indices(pa.concat_tables(tables), kind), minlength=len(LABELS[kind]))
+    indices = np.concatenate([read_label_indices(shard, kind, thresholds) for shard in shards])
+    counts = np.bincount(indices, minlength=len(LABELS[kind]))
     named = set(list_usual_labels(kind))
     missing = [name for name, count in zip(LABELS[kind], counts, strict=True) if count == 0 and name in named]
     if len(counts) > 1 and (counts > 0).sum() == 1:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass, replace
 from functools import partial
 from typing import Any
@@ -11,7 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from jobs.implementation.checks import check_train_lvae, find_start, find_training_dataset, needs_smoke_inputs
+from jobs.implementation.checks import (
+    check_train_lvae,
+    find_start,
+    find_training_dataset,
+    needs_smoke_inputs,
+    open_mixture,
+)
 from jobs.implementation.smoke_inputs import make_smoke_dataset
 from jobs.support import trainer
 from jobs.support.callbacks import ReconstructionCheck
@@ -37,10 +43,10 @@ from models.training import (
 )
 from pipelines.generation.sample import load_pipeline
 from pipelines.runtime import storage
-from pipelines.schema.dataset import Dataset
-from pipelines.schema.tables import find_shards
+from pipelines.schema.tables import Shard, find_shards
 from pipelines.training.data_loader import LayoutReader, Stream
 from pipelines.training.latents import digest_weights, load_lvae
+from pipelines.training.mixed_stream import mix_streams
 
 # Options of the object branch that concern the decoder.
 OF_OBJECT_DECODER = (
@@ -66,26 +72,39 @@ def prepare(config: Config) -> TrainingRun:
     root = find_training_dataset(config, row.source)
     if needs_smoke_inputs(config):
         make_smoke_dataset(root)
-    dataset = Dataset.open(root)
-    spec = dataset.spec.with_resolution(row.raster_px)
+    mixture = open_mixture(config, row.source)
+    dataset = mixture.datasets[0]
     settings = make_optimizer_config(config, row)
-    shards = find_shards(root, source=dataset.source, split="train")
-    counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
-    augment = Augmentation(config.flip, *((1.0, np.radians(2.5)) if config.jitter else (0.0, 0.0)), config.seed)
-    identity = make_run_identity(config, row, settings, spec, root, augment)
+    streams = []
+    for one in mixture.datasets:
+        shards = find_shards(one.root, source=one.source, split="train")
+        counts = tuple(shard.read("scenes", ["scene_id"]).num_rows for shard in shards)
+        streams.append(Stream(tuple(shards), counts, row.batch_size, config.seed))
+    stream = mix_streams(streams, mixture.weights)
     name = find_run_name(config)
     kept = start = None
+    spec = mixture.layout.with_resolution(row.raster_px)
     if config.start_from:
-        start = load_start(config.start_from, row.architecture(), spec)
-        identity |= {"start_from": digest_weights(start)}
+        start = load_start(config.start_from, row.architecture(), None if config.add_datasets else spec)
+        spec = start.spec
     if config.train_object_decoder_of:
-        kept = load_kept_weights(config.train_object_decoder_of, row.architecture(), spec)
-        identity |= {"start_from": kept.digest}
+        kept = load_kept_weights(
+            config.train_object_decoder_of, row.architecture(), None if config.add_datasets else spec
+        )
+        spec = kept.spec
         require_replaceable(name, kept)
+    for note in mixture.require_cover(spec):
+        print(f"note: {note}; training clips these values" if "bounds" in note else f"note: {note}")
+    augment = Augmentation(config.flip, *((1.0, np.radians(2.5)) if config.jitter else (0.0, 0.0)), config.seed)
+    identity = make_run_identity(config, row, settings, spec, root, augment) | mixture.identity()
+    if start:
+        identity |= {"start_from": digest_weights(start)}
+    if kept:
+        identity |= {"start_from": kept.digest}
     record = trainer.guard_run_name(name, home_path("runs"), identity)
     tracker = Tracker.start("pritti-lvae", name, identity | {"architecture": row.architecture()}, record)
     execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
-    sample = sample_layouts(shards, counts, spec)
+    sample = sample_layouts(stream.shards, stream.counts, spec)
     return TrainingRun(
         name=name,
         round_weights=config.round_weights,
@@ -102,7 +121,7 @@ def prepare(config: Config) -> TrainingRun:
             kept,
             start and start.state_dict(),
         ),
-        stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
+        stream=stream,
         reader=LayoutReader(spec, augment if config.flip or config.jitter else None),
         settings=settings,
         identity=identity,
@@ -188,10 +207,11 @@ class Kept:
     digest: str
     transformer: str
     state: dict[str, Tensor]
+    spec: LayoutSpec
 
 
-def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
-    """Return the layout VAE of a trained pipeline.
+def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec | None) -> Kept:
+    """Return the layout VAE of a trained pipeline; `spec` is the layout that it needs to have.
 
     Raises:
         ValueError: The encoders or the layout of the pipeline differ from those of this run.
@@ -204,15 +224,15 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
                 f"--train-object-decoder-of {model}: its {key} is {built}, but that of this preset is {wanted}; "
                 "use the preset of this pipeline"
             )
-    if lvae.spec.fingerprint() != spec.fingerprint():
+    if spec and lvae.spec.fingerprint() != spec.fingerprint():
         raise ValueError(
             f"--train-object-decoder-of {model}: its layout differs from that of this dataset; "
             "use the dataset of this pipeline"
         )
-    return Kept(digest_weights(lvae), digest_weights(pipeline.dit), lvae.state_dict())
+    return Kept(digest_weights(lvae), digest_weights(pipeline.dit), lvae.state_dict(), lvae.spec)
 
 
-def load_start(model: str, architecture: dict, spec: LayoutSpec) -> LayoutVAE:
+def load_start(model: str, architecture: dict, spec: LayoutSpec | None) -> LayoutVAE:
     """Return the trained layout VAE from which a run starts.
 
     The networks of the decoder "cells" do not depend on the number of slots, which may therefore differ.
@@ -220,7 +240,7 @@ def load_start(model: str, architecture: dict, spec: LayoutSpec) -> LayoutVAE:
     Args:
         model: Directory of a layout VAE, or any value that --model accepts.
         architecture: Options of the preset.
-        spec: Layout of the dataset.
+        spec: Layout of the dataset. None: any layout.
 
     Raises:
         ValueError: The networks or the layout differ from those of this run.
@@ -233,6 +253,8 @@ def load_start(model: str, architecture: dict, spec: LayoutSpec) -> LayoutVAE:
                 f"--start-from {model}: its {key} is {built}, but that of this preset is {wanted}; use the preset with"
                 " which it was trained"
             )
+    if spec is None:
+        return lvae
     may_resize = lvae.config.objects["decoder"] == "cells" and len(lvae.spec.slots) == len(spec.slots)
     own = replace(lvae.spec, slots=spec.slots) if may_resize else lvae.spec
     own.require(spec, f"the dataset of this run, which continues {model},")
@@ -296,7 +318,7 @@ def write_updated_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
     return output
 
 
-def sample_layouts(shards: list, counts: list[int], spec) -> dict:
+def sample_layouts(shards: Sequence[Shard], counts: Sequence[int], spec: LayoutSpec) -> dict:
     """Return compact layouts of up to START_SCENES training scenes for `init_from_data`.
 
     The scenes are selected evenly from the dataset.

@@ -39,6 +39,20 @@ PagScaleOption = Annotated[
         " data (default: as the model stores)."
     ),
 ]
+AddDatasetsOption = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        help="Further dataset directories to train on. The layout covers all datasets, or is that of the model with"
+        " which training starts (default: none)."
+    ),
+]
+DatasetWeightsOption = Annotated[
+    tuple[float, ...],
+    tyro.conf.arg(
+        help="Share of the samples from --dataset and from each of --add-datasets, up to a common factor; with 0, a"
+        " dataset only widens the layout (default: equal shares)."
+    ),
+]
 GpusOption = Annotated[
     float | None,
     tyro.conf.arg(

@@ -37,7 +37,7 @@ from models.training import NonFiniteLossError, OptimizerConfig, Trainer
 from pipelines.runtime import storage
 from pipelines.runtime.resources import count_gpus_per_model, count_room, find_device, require_room
 from pipelines.schema.run_guard import guard_options
-from pipelines.training.data_loader import READER_CPUS, Reader, Stream, iterate_batches, split_batch
+from pipelines.training.data_loader import READER_CPUS, Reader, SampleOrder, iterate_batches, split_batch
 from pipelines.training.latents import digest_weights
 
 Wrap = Callable[[torch.nn.Module], torch.nn.Module]
@@ -60,7 +60,7 @@ class TrainingRun:
     name: str
     storage_path: str
     build: Callable[[torch.device, Wrap], Trainer]
-    stream: Stream
+    stream: SampleOrder
     reader: Reader
     settings: OptimizerConfig
     identity: dict
@@ -187,7 +187,7 @@ def read_step(run: TrainingRun) -> int:
 
 
 def with_sample_ids(
-    error: NonFiniteLossError, stream: Stream, id_column: tuple[str, str] = ("scenes", "scene_id")
+    error: NonFiniteLossError, stream: SampleOrder, id_column: tuple[str, str] = ("scenes", "scene_id")
 ) -> str:
     """Return the error message for a non-finite loss, with the ids of the samples that caused this loss.
 

@@ -18,11 +18,9 @@ from models.scene import Scene, merge_scenes
 from pipelines.generation.sample import (
     Request,
     find_scene_label,
-    from_model_surface,
     guard_generation_run,
     load_pipeline,
     resample_to_model_resolution,
-    to_model_surface,
 )
 from pipelines.io.mesh_export import export_glb
 from pipelines.metrics.reconstruction import sum_pairs
@@ -30,6 +28,7 @@ from pipelines.reporting.inpaint_report import InpaintExample, render_inpaint_ht
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
 from pipelines.schema.file_names import make_file_name
+from pipelines.schema.ground_surface import from_model_surface, to_model_surface
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, find_unwritten, require_written
 

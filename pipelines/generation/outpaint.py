@@ -39,7 +39,6 @@ from pipelines.generation.sample import (
     guard_generation_run,
     load_pipeline,
     resample_to_model_grid,
-    to_model_surface,
 )
 from pipelines.generation.street_plans import (
     Part,
@@ -56,6 +55,7 @@ from pipelines.io.tileset import TileContent, find_tile_bounds, make_tileset
 from pipelines.reporting.city_page import pack_overview, pack_tile, render_city_html
 from pipelines.runtime import storage
 from pipelines.runtime.resources import make_model_resources, require_room
+from pipelines.schema.ground_surface import to_model_surface
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, find_unwritten, require_written
 

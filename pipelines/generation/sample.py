@@ -13,7 +13,7 @@ import torch
 
 from models.execution import SamplingExecution
 from models.labels import LABELS, compose_label, require_labels
-from models.layout import SLAB_OFFSET_M, LayoutSpec
+from models.layout import LayoutSpec
 from models.pipeline import PrITTIPipeline
 from models.sampling.constraints import GuidanceReport
 from models.scene import Grid, Scene
@@ -23,7 +23,6 @@ from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
 from pipelines.runtime.resources import find_device
 from pipelines.schema.columns import SCENE_TABLES
-from pipelines.schema.dataset import find_surface
 from pipelines.schema.run_guard import guard_run
 from pipelines.schema.tables import Shard, find_unwritten, require_written
 from pipelines.training.latents import digest_weights
@@ -203,42 +202,6 @@ def resample_to_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
     own, wanted_m = scene.grid, spec.grid.resolution_m
     sides = {name: round(getattr(own, name) * own.resolution_m / wanted_m) for name in ("rows", "cols")}
     return resample_to_model_grid(scene, spec, replace(own, resolution_m=wanted_m, **sides))
-
-
-def to_model_surface(scene: Scene, spec: LayoutSpec) -> Scene:
-    """Convert the ground heights of a real scene to the reference surface of the model (`LayoutSpec.surface`).
-
-    Args:
-        scene: Scene. The heights of generated scenes are not changed, because they have the surface of their model.
-        spec: Layout of the model.
-
-    Returns:
-        The same scene, or a scene whose ground is higher or lower by SLAB_OFFSET_M.
-    """
-    return _raise_ground(scene, _find_surface_offset(scene, spec))
-
-
-def from_model_surface(scene: Scene, given: Scene, spec: LayoutSpec) -> Scene:
-    """Convert the ground heights of a generated scene to the reference surface of its input.
-
-    Args:
-        scene: Scene.
-        given: Scene from which it was generated.
-        spec: Layout of the model.
-
-    Returns:
-        The scene.
-    """
-    return _raise_ground(scene, -_find_surface_offset(given, spec))
-
-
-def _find_surface_offset(scene: Scene, spec: LayoutSpec) -> float:
-    """Return the height of the reference surface of the model above that of a scene (m); 0 for generated scenes."""
-    return spec.slab_offset_m - (SLAB_OFFSET_M if find_surface(scene, spec.surface) == "top" else 0.0)
-
-
-def _raise_ground(scene: Scene, offset_m: float) -> Scene:
-    return replace(scene, height_m=scene.height_m + np.float32(offset_m) * scene.occupied) if offset_m else scene
 
 
 def find_scene_label(scene: Scene, kind: str) -> str:

@@ -26,7 +26,7 @@ from pipelines.preprocess.sources.drive import Drive
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import MAX_RETRIES, map_rows
 from pipelines.schema.attribution import find_attribution
-from pipelines.schema.columns import SCENE_TABLES, SCHEMA_VERSION
+from pipelines.schema.columns import SCENE_TABLES, SCENES, SCHEMA_VERSION
 from pipelines.schema.dataset import DESCRIPTION, Statistics, compute_training_statistics, label_scenes
 from pipelines.schema.run_guard import compare_options
 from pipelines.schema.tables import Shard
@@ -104,7 +104,10 @@ def publish_shards(root: str, staging: str, manifests: list[dict], statistics: S
     def publish(row: dict) -> dict:
         """Label the scenes of the shard whose number is in the row."""
         staged, final = (Shard(base, row["source"], row["split"], row["number"]) for base in (staging, root))
-        storage.write_parquet(label_scenes(staged.read("scenes"), statistics), final.path("scenes"))
+        storage.write_parquet(
+            label_scenes(staged.read("scenes"), statistics.vegetation, statistics.vehicle).cast(SCENES),
+            final.path("scenes"),
+        )
         return row
 
     promised = {path: rows for m in manifests for path, rows in list_promised_rows(m, root, root).items()}

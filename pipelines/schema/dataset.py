@@ -12,30 +12,15 @@ import numpy as np
 import pyarrow as pa
 
 from models.layout import Bounds, LayoutSpec
-from models.scene import CATEGORIES, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
+from models.scene import CATEGORIES, GROUND_CLASSES, VEGETATION, VEHICLES, Grid
 from pipelines.runtime import storage
 from pipelines.schema.columns import SCENES
 from pipelines.schema.density_labels import DensityThresholds, classify_density, compute_density_thresholds
+from pipelines.schema.ground_surface import SURFACE
 from pipelines.schema.tables import Shard
 
 DESCRIPTION = "dataset.json"
 Extremes = dict[str, list[list[float]]]  # Name -> [lowest, highest]; both are lists with one value per component.
-# Per source, the surface to which the ground heights refer. "surface" is the surface on which objects stand.
-# "top" is the top of the ground slabs, 0.3 m above that surface.
-SURFACE = {"town": "top", "kitti360": "top"} | dict.fromkeys(("av2", "osm", "opendrive", "own", "py123d"), "surface")
-
-
-def find_surface(scene: Scene, default: str) -> str:
-    """Return the surface to which the ground heights of a scene refer.
-
-    Args:
-        scene: Scene. Edited scenes keep the id of the scene that was edited, which begins with its source.
-        default: Surface of other scenes, such as generated ones.
-
-    Returns:
-        "top" or "surface" (SURFACE).
-    """
-    return SURFACE.get(scene.source) or SURFACE.get(scene.scene_id.partition("-")[0], default)
 
 
 @dataclass(frozen=True)
@@ -127,24 +112,32 @@ def compute_training_statistics(
     )
 
 
-def label_scenes(scenes: pa.Table, statistics: Statistics) -> pa.Table:
+# Columns of the scenes table from which density labels are computed.
+DENSITY_COLUMNS = (
+    *(f"num_{CATEGORIES[k]}" for k in (*VEGETATION, *VEHICLES)),
+    *("vegetation_volume_m3", "vehicle_volume_m3", "vegetation_density", "vehicle_density"),
+)
+
+
+def label_scenes(scenes: pa.Table, vegetation: DensityThresholds, vehicle: DensityThresholds) -> pa.Table:
     """Fill both density labels of the scenes table.
 
     Args:
-        scenes: Rows of the scenes table.
-        statistics: Statistics of the training split; they contain the label thresholds.
+        scenes: Rows of the scenes table, with at least DENSITY_COLUMNS.
+        vegetation: Thresholds of the vegetation density label.
+        vehicle: Thresholds of the vehicle density label.
 
     Returns:
         The scenes table with values in the columns vegetation_density and vehicle_density.
     """
-    groups = (("vegetation", VEGETATION, statistics.vegetation), ("vehicle", VEHICLES, statistics.vehicle))
+    groups = (("vegetation", VEGETATION, vegetation), ("vehicle", VEHICLES, vehicle))
     for name, group, thresholds in groups:
         labels = classify_density(count_groups(scenes, group), scenes[f"{name}_volume_m3"].to_numpy(), thresholds)
         column = f"{name}_density"
         scenes = scenes.set_column(
             scenes.column_names.index(column), SCENES.field(column), pa.array(labels, pa.string())
         )
-    return scenes.cast(SCENES)
+    return scenes
 
 
 @dataclass(frozen=True)

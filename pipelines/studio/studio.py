@@ -21,7 +21,6 @@ from pipelines.generation.sample import (
     find_scene_label,
     load_pipeline,
     resample_to_model_resolution,
-    to_model_surface,
 )
 from pipelines.geometry.parked_vehicles import find_driving_vehicles
 from pipelines.io.mesh_export import export_glb
@@ -33,6 +32,7 @@ from pipelines.reporting.scene_index import Catalogue
 from pipelines.runtime import storage
 from pipelines.schema.conversion import parse_scenes
 from pipelines.schema.file_names import make_file_name
+from pipelines.schema.ground_surface import to_model_surface
 from pipelines.schema.tables import Shard
 from pipelines.schema.tracks import read_tracks, select_tracks
 from pipelines.studio.limits import StudioError, StudioLimits

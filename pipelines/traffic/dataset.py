@@ -14,7 +14,7 @@ from models.scene import Scene
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_tasks
 from pipelines.schema.columns import TRACKS, TRAFFIC, TRAFFIC_TABLES
-from pipelines.schema.dataset import find_surface
+from pipelines.schema.ground_surface import find_surface
 from pipelines.schema.run_guard import guard_options
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard

@@ -13,11 +13,11 @@ to four times as long as with this loader (docs/experiments/reading_training_dat
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice
-from typing import cast
+from typing import Protocol, cast
 
 import numpy as np
 import pyarrow as pa
@@ -29,17 +29,34 @@ from models.layout import LayoutSpec
 from models.scene import Grid
 from models.tensors import encode_height, encode_layout, encode_primitives, resample_ground
 from pipelines.schema.conversion import find_category_indices, list_ground_steps, parse_scenes, read_fixed_lists
+from pipelines.schema.dataset import DENSITY_COLUMNS, label_scenes
+from pipelines.schema.density_labels import DensityThresholds
+from pipelines.schema.ground_surface import SURFACE, find_offset, to_model_surface
 from pipelines.schema.tables import Shard
 from pipelines.schema.validation import validate_shard
 
 WINDOW_SHARDS = 4
+CACHED_SHARDS = 4 * WINDOW_SHARDS  # Number of shards in memory: the windows of four datasets.
 SAMPLES_PER_TASK = 256
 AHEAD = 2  # Number of tasks that read samples in advance, while the training uses the samples of another task.
 READ_HERE_AFTER_S = 60.0  # Time after which a worker reads samples itself, because no task has read them.
 READER_CPUS = 0.5  # With more CPUs per reader, readers and training workers would wait for each other on two cores.
 
 Arrays = dict[str, np.ndarray]
+Thresholds = tuple[DensityThresholds, DensityThresholds] | None  # Of the vegetation and the vehicle density.
 Reader = Callable[[Shard, np.ndarray, np.ndarray], Arrays]  # (Shard, rows, positions in the stream) -> samples.
+
+
+class SampleOrder(Protocol):
+    """The endless, seeded order of training samples: `Stream`, or `MixedStream` of mixture.py."""
+
+    @property
+    def shards(self) -> tuple[Shard, ...]: ...
+
+    @property
+    def batch_size(self) -> int: ...
+
+    def positions(self, first: int, count: int) -> tuple[np.ndarray, np.ndarray]: ...
 
 
 @dataclass(frozen=True)
@@ -116,7 +133,9 @@ def split_batch(batch: int, rank: int, world: int) -> range:
     return range(rank * batch // world, (rank + 1) * batch // world)
 
 
-def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: int, rank: int, world: int) -> Arrays:
+def read_samples(
+    stream: SampleOrder, read: Reader, first: int, count: int, batch: int, rank: int, world: int
+) -> Arrays:
     """Read, in order, the samples of one rank in `count` consecutive global batches, beginning with batch `first`."""
     shard, row = stream.positions(first * batch, count * batch)
     mine = np.isin(np.arange(count * batch) % batch, split_batch(batch, rank, world))
@@ -132,7 +151,7 @@ def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: in
 
 
 def iterate_batches(
-    stream: Stream, read: Reader, start_step: int, stop_step: int, rank: int = 0, world: int = 1
+    stream: SampleOrder, read: Reader, start_step: int, stop_step: int, rank: int = 0, world: int = 1
 ) -> Iterator[Arrays]:
     """Yield the local batches of one worker for steps start_step .. stop_step - 1.
 
@@ -191,7 +210,8 @@ class LayoutReader:
             if places is None:
                 raise ValueError("augmentation needs the position of each sample in the stream")
             scenes = parse_scenes(*_read_tables(shard), shard.source, shard.split, rows.tolist())
-            layouts = (encode_layout(augment(s, int(k)), self.spec) for s, k in zip(scenes, places, strict=True))
+            moved = (augment(to_model_surface(s, self.spec), int(k)) for s, k in zip(scenes, places, strict=True))
+            layouts = (encode_layout(scene, self.spec) for scene in moved)
         else:
             stored = _read_stored_layouts(shard)
             layouts = (stored.layout(int(row), self.spec) for row in rows)
@@ -204,7 +224,7 @@ class LayoutReader:
         return out
 
 
-@lru_cache(maxsize=2 * WINDOW_SHARDS)
+@lru_cache(maxsize=CACHED_SHARDS)
 def _read_tables(shard: Shard) -> tuple[pa.Table, pa.Table, pa.Table]:
     return shard.read_tables()
 
@@ -220,6 +240,7 @@ class StoredLayouts:
         center_m: (n, 3) centre of each primitive (m, scene frame).
         cholesky: (n, 6) Cholesky parameters of each primitive.
         rasters: Rasters table.
+        source: Source of the scenes, which determines their reference surface.
     """
 
     first: np.ndarray
@@ -228,6 +249,11 @@ class StoredLayouts:
     center_m: np.ndarray
     cholesky: np.ndarray
     rasters: pa.Table
+    source: str
+
+    def offset_m(self, spec: LayoutSpec) -> float:
+        """Return the height of the reference surface of the model above that of these scenes (m)."""
+        return find_offset(SURFACE.get(self.source, spec.surface), spec)
 
     def layout(self, row: int, spec: LayoutSpec) -> Arrays:
         """Encode one scene like `encode_layout`."""
@@ -242,7 +268,7 @@ class StoredLayouts:
         classes = raster["ground_classes"]
         steps, mask = list_ground_steps(raster["height"], raster["occupied"], (len(classes), grid.rows, grid.cols))
         height = np.zeros(mask.shape, np.uint16)
-        height[mask] = _scale_steps(spec, raster["height_step_m"])[steps.view(np.uint16)]
+        height[mask] = _scale_steps(spec, raster["height_step_m"], self.offset_m(spec))[steps.view(np.uint16)]
         if classes != list(spec.ground_classes):
             place = [classes.index(name) if name in classes else -1 for name in spec.ground_classes]
             height, mask = (np.stack([v[k] if k >= 0 else np.zeros_like(v[0]) for k in place]) for v in (height, mask))
@@ -251,13 +277,13 @@ class StoredLayouts:
 
 
 @lru_cache(maxsize=4)
-def _scale_steps(spec: LayoutSpec, step_m: float) -> np.ndarray:
-    """Return (65536,) uint16: the result of `encode_height` for each 16-bit stored height."""
+def _scale_steps(spec: LayoutSpec, step_m: float, offset_m: float) -> np.ndarray:
+    """Return (65536,) uint16: the result of `encode_height` for each 16-bit stored height, plus an offset."""
     steps = np.arange(2**16, dtype=np.uint16).view(np.int16)
-    return encode_height(steps * np.float32(step_m), spec)
+    return encode_height(steps * np.float32(step_m) + np.float32(offset_m), spec)
 
 
-@lru_cache(maxsize=2 * WINDOW_SHARDS)
+@lru_cache(maxsize=CACHED_SHARDS)
 def _read_stored_layouts(shard: Shard) -> StoredLayouts:
     scenes = shard.read("scenes", ["scene_id", "primitive_offset", "num_primitives"])
     columns = ["scene_id", "category", "x_m", "y_m", "z_m", "cholesky"]
@@ -274,22 +300,23 @@ def _read_stored_layouts(shard: Shard) -> StoredLayouts:
         center_m=np.stack([primitives[f"{axis}_m"].to_numpy() for axis in "xyz"], axis=1),
         cholesky=read_fixed_lists(primitives["cholesky"], 6),
         rasters=rasters.combine_chunks(),
+        source=shard.source,
     )
 
 
-@lru_cache(maxsize=2 * WINDOW_SHARDS)
-def _read_latents(shard: Shard, latents_root: str, label: str) -> Arrays:
+@lru_cache(maxsize=CACHED_SHARDS)
+def _read_latents(shard: Shard, latents_root: str, label: str, thresholds: Thresholds) -> Arrays:
     table = Shard(latents_root, shard.source, shard.split, shard.number).read("latents")
-    scenes = shard.read("scenes", ["scene_id", *LABEL_COLUMNS])
+    scenes = shard.read("scenes", ["scene_id"])
     if table["scene_id"].to_pylist() != scenes["scene_id"].to_pylist():
         raise ValueError(
             f"{shard.path('latents')} is not aligned with {shard.path('scenes')}; encode the latents again"
         )
     moments = {name: table[name].combine_chunks().to_numpy_ndarray() for name in ("mean", "logvar")}
-    return moments | {"label": label_indices(scenes, label)}
+    return moments | {"label": read_label_indices(shard, label, thresholds)}
 
 
-@lru_cache(maxsize=2 * WINDOW_SHARDS)
+@lru_cache(maxsize=CACHED_SHARDS)
 def _read_street_latents(shard: Shard, latents_root: str) -> Arrays:
     table = Shard(latents_root, shard.source, shard.split, shard.number).read("street_latents")
     if table["scene_id"].to_pylist() != shard.read("scenes", ["scene_id"])["scene_id"].to_pylist():
@@ -309,6 +336,17 @@ def repeat_crops(scenes: pa.Table, repeats: int) -> tuple[int, ...]:
     return tuple(np.repeat(np.arange(len(crop)), np.where(crop, repeats, 1)).tolist())
 
 
+def read_label_indices(shard: Shard, label: str, thresholds: Thresholds = None) -> np.ndarray:
+    """Return (n,) int64: the index of the label of each scene of a shard in LABELS[label].
+
+    With thresholds of the vegetation and the vehicle density, the labels are computed; otherwise, the stored labels are
+    used.
+    """
+    if thresholds is None:
+        return label_indices(shard.read("scenes", list(LABEL_COLUMNS)), label)
+    return label_indices(label_scenes(shard.read("scenes", [*DENSITY_COLUMNS, "free_pose"]), *thresholds), label)
+
+
 def label_indices(scenes: pa.Table, label: str) -> np.ndarray:
     """Return (n,) int64: for each row of a scenes table, the index of its label in LABELS[label]."""
     parts = zip(*(scenes[name].to_pylist() for name in LABEL_COLUMNS), strict=True)
@@ -324,14 +362,20 @@ class LatentReader:
         latents_root: Directory of the latents.
         label: Kind of label.
         streets: Whether to read the latents of the streets, too.
+        added: Directories of the latents of further datasets, by dataset directory.
+        thresholds: Thresholds of the vegetation and the vehicle density, from which labels are computed. None: each
+            scene has its stored label.
     """
 
     latents_root: str
     label: str
     streets: bool = False
+    added: Mapping[str, str] = field(default_factory=dict)
+    thresholds: Thresholds = None
 
     def __call__(self, shard: Shard, rows: np.ndarray, places: np.ndarray | None = None) -> Arrays:
-        arrays = _read_latents(shard, self.latents_root, self.label)
+        root = self.added.get(shard.root, self.latents_root)
+        arrays = _read_latents(shard, root, self.label, self.thresholds)
         if self.streets:
-            arrays = arrays | _read_street_latents(shard, self.latents_root)
+            arrays = arrays | _read_street_latents(shard, root)
         return {name: values[rows] for name, values in arrays.items()}

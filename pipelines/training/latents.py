@@ -19,6 +19,7 @@ from pipelines.runtime.ray_tasks import map_actors
 from pipelines.runtime.resources import find_device
 from pipelines.schema.columns import make_latents_schema, make_street_latents_schema
 from pipelines.schema.dataset import Dataset
+from pipelines.schema.ground_surface import to_model_surface
 from pipelines.schema.tables import Shard, find_shards
 
 
@@ -64,9 +65,8 @@ class Encoder:
         scenes, spec = shard.scenes(), self.model.spec
         parts = []
         for start in range(0, len(scenes), self.batch_size):
-            posterior = self.model.encode(
-                make_layout_batch(scenes[start : start + self.batch_size], spec).to(self.device)
-            )
+            chosen = [to_model_surface(scene, spec) for scene in scenes[start : start + self.batch_size]]
+            posterior = self.model.encode(make_layout_batch(chosen, spec).to(self.device))
             parts.append([v.half().cpu().numpy() for v in (posterior.mean, posterior.logvar)])
         mean, logvar = (np.concatenate(group) for group in zip(*parts, strict=True))
         return [scene.scene_id for scene in scenes], mean, logvar
@@ -78,7 +78,7 @@ class Encoder:
         channels, size, _ = self.model.latent_shape
         grounds, cells = [], []
         for start in range(0, len(scenes), self.batch_size):
-            kept = [keep_streets(scene) for scene in scenes[start : start + self.batch_size]]
+            kept = [keep_streets(to_model_surface(s, spec)) for s in scenes[start : start + self.batch_size]]
             batch = make_layout_batch([scene for scene, _ in kept], spec).to(self.device)
             grounds.append(self.model.encode(batch).mean[:, : channels // 2].half().cpu().numpy())
             cells += [~find_region_cells(~paved, size) for _, paved in kept]
@@ -138,11 +138,13 @@ def encode_latents(
         Content of latents.json.
 
     Raises:
-        ValueError: The LVAE and the dataset have different LayoutSpecs, the directory contains latents of another LVAE,
-            or latents of streets are requested although the latents mix ground and objects or lack a class.
+        ValueError: The layout of the LVAE lacks a category or a ground class of the dataset or covers another area, the
+            directory contains latents of another LVAE, or latents of streets are requested although the latents mix
+            ground and objects or lack a class.
     """
     model = load_lvae(lvae)
-    dataset.spec.with_resolution(model.spec.grid.rows).require(model.spec, f"{lvae}")
+    for note in model.spec.require_cover(dataset.spec, dataset.root):
+        print(f"note: {note}")
     if streets and (not model.config.split_latent or {ROAD, SIDEWALK, TERRAIN} - set(model.spec.ground_classes)):
         raise ValueError(f"{lvae} has no separate latent for road, sidewalk and terrain; encode without streets")
     description, digest = storage.join_uri(output, "latents.json"), digest_weights(model)

@@ -20,6 +20,7 @@ from models.training import OptimizerConfig, make_dit_trainer
 from pipelines.preprocess.street_maps import compute_map_thresholds
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import find_shards
+from pipelines.training.data_loader import LatentReader
 from pipelines.training.latents import digest_weights
 from pipelines.training.street_map_reader import StreetMapReader
 
@@ -331,11 +332,13 @@ def test_train_lvae_starts_from_trained_weights(home):
 def test_encode_rejects_lvae_of_another_dataset(home, tmp_path):
     from jobs.encode_latents import Config
     from jobs.implementation.encode_latents import encode
-    from jobs.implementation.preprocess_scenes import main
-    from jobs.preprocess_scenes import Town
 
-    main(Town(output=str(tmp_path), num_train=8, num_test=8, seed=5))
-    with pytest.raises(ValueError, match=r"lvae-smoke has another LayoutSpec: \w+ is .*, expected .*; use the dataset"):
+    shutil.copytree(home / "datasets/smoke", tmp_path, dirs_exist_ok=True)
+    about = json.loads((tmp_path / "dataset.json").read_text())
+    about["layout"]["ground_classes"].append("crossing")
+    (tmp_path / "dataset.json").write_text(json.dumps(about))
+    shutil.rmtree(tmp_path / "latents")
+    with pytest.raises(ValueError, match=r"has the ground_classes crossing, which the layout of the model lacks"):
         encode(Config(dataset=str(tmp_path), lvae=str(home / "models/lvae-smoke")))
     assert not (tmp_path / "latents").exists()
 
@@ -371,3 +374,58 @@ def test_encode_reports_worker_error_in_one_line(home, tmp_path):
     lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert done.returncode == 2 and len(lines) == 1, done.stderr[-2000:]
     assert path.name in lines[0] and "delete it and run the job that wrote it again" in lines[0]
+
+
+def test_models_train_on_two_datasets(home, tmp_path, capsys):
+    """Both stages mix a town and a dataset of another surface, with one layout and the labels of the first."""
+    from jobs.encode_latents import Config as EncodeConfig
+    from jobs.implementation.checks import check_train_dit
+    from jobs.implementation.encode_latents import encode
+    from jobs.implementation.train_dit import prepare as prepare_dit
+    from jobs.implementation.train_dit import train as train_dit
+    from jobs.implementation.train_lvae import prepare, train
+    from jobs.train_dit import Config as DiTConfig
+    from jobs.train_lvae import Config
+
+    town, maps = str(home / "datasets/smoke"), str(tmp_path / "maps")
+    for shard in find_shards(town):
+        scenes = [
+            replace(
+                scene, source="osm", scene_id=f"osm-{scene.scene_id}", height_m=scene.height_m - 0.3 * scene.occupied
+            )
+            for scene in shard.scenes()
+        ]
+        replace(shard, root=maps, source="osm").write(scenes)
+    about = json.loads(Path(town, "dataset.json").read_text()) | {"source": "osm"}
+    about["layout"] |= {"surface": "surface", "height_bounds_m": {"low": [-9.0], "high": [9.0]}}
+    Path(maps, "dataset.json").write_text(json.dumps(about))
+
+    mixed = {"add_datasets": (maps,), "dataset_weights": (2.0, 1.0), "dataset": town, "preset": "smoke"}
+    lvae = train(Config(**mixed, name="lvae-mixed"))
+    layout = json.loads(Path(lvae, "config.json").read_text())["layout"]
+    assert layout["height_bounds_m"] == {"low": [-8.7], "high": [9.3]} and layout["surface"] == "top"
+    with pytest.raises(ValueError, match=r"'lvae-mixed' was started with dataset_weights"):
+        prepare(Config(**{**mixed, "dataset_weights": (1.0, 1.0)}, name="lvae-mixed"))
+    start = prepare(Config(**mixed, name="lvae-more", start_from=str(home / "models/lvae-smoke")))
+    assert "z of ground heights from -8.7 to 9.3 m, but the bounds of the layout are" in capsys.readouterr().out
+    built = start.build(torch.device("cpu"), lambda model: model).model
+    assert built.spec == Dataset.open(town).spec.with_resolution(32)
+
+    latents = [str(tmp_path / name) for name in ("town-latents", "map-latents")]
+    for root, output in zip((town, maps), latents, strict=True):
+        encode(EncodeConfig(dataset=root, lvae=lvae, output=output))
+    options = mixed | {"latents": latents[0], "add_latents": (latents[1],), "label_kind": "joint"}
+    with pytest.raises(ValueError, match=r"map.*no latents\.json here"):
+        check_train_dit(DiTConfig(**{**options, "add_latents": ()}))
+    with pytest.raises(ValueError, match=r"latents of another layout VAE.*--add-latents"):
+        check_train_dit(DiTConfig(**{**options, "latents": ""}))
+    run, _ = prepare_dit(DiTConfig(**options, name="dit-prepared"))
+    assert {shard.source for shard in run.stream.shards} == {"town", "osm"}
+    shard = next(shard for shard in run.stream.shards if shard.source == "osm")
+    arrays = run.reader(shard, np.arange(4))
+    same = LatentReader(latents[0], "joint")(replace(shard, root=town, source="town"), np.arange(4))
+    # The scenes are those of the town on another surface, so their latents and labels are equal.
+    assert np.abs(arrays["mean"].astype(float) - same["mean"]).max() < 0.05
+    assert arrays["label"].tolist() == same["label"].tolist()
+    output = train_dit(DiTConfig(**options, name="dit-mixed"))
+    assert Path(output, "model_index.json").exists()

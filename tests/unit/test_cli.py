@@ -88,7 +88,9 @@ def test_option_modules_import_nothing_heavy():
 
 
 SHARED = (
+    "AddDatasetsOption",
     "ConstraintsOption",
+    "DatasetWeightsOption",
     "ModelOption",
     "PagScaleOption",
     "IfBusyOption",

@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 from helpers import SHARD_SIZES, small_spec
 
-from jobs.implementation.train_dit import make_stream
+from jobs.implementation.train_dit import make_streams
 from jobs.support.trainer import with_sample_ids
 from jobs.train_dit import Config
 from models.augment import Augmentation
@@ -38,11 +38,11 @@ def test_repeated_rows_are_visited_that_often_per_epoch(layout_shards):
 
 def test_crop_repeats_needs_crops(layout_shards):
     shards = list(layout_shards)
-    assert make_stream(Config(), shards, 4) == Stream(layout_shards, SHARD_SIZES, 4, 0)
+    assert make_streams(Config(), [shards], 4) == [Stream(layout_shards, SHARD_SIZES, 4, 0)]
     with pytest.raises(ValueError, match="--crop-repeats 2: the dataset has no crops"):
-        make_stream(Config(crop_repeats=2), shards, 4)
+        make_streams(Config(crop_repeats=2), [shards], 4)
     with pytest.raises(ValueError, match="--crop-repeats 0: use 1 or more"):
-        make_stream(Config(crop_repeats=0), shards, 4)
+        make_streams(Config(crop_repeats=0), [shards], 4)
 
 
 def test_read_samples_equals_layouts_of_stored_scenes(layout_shards):

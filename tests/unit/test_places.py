@@ -8,10 +8,10 @@ from helpers import random_scene, small_spec
 from osm_map import LATITUDE, LONGITUDE, make_town_street
 
 from models.scene import CATEGORY_INDEX, Scene
-from pipelines.generation.sample import from_model_surface, to_model_surface
 from pipelines.io.opendrive import export_opendrive
 from pipelines.preprocess.places import PlaceOptions, read_place
 from pipelines.schema.attribution import ATTRIBUTIONS
+from pipelines.schema.ground_surface import from_model_surface, to_model_surface
 
 HERE = PlaceOptions((LATITUDE, LONGITUDE), 128.0)
 

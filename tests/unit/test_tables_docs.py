@@ -21,7 +21,6 @@ import pyarrow.parquet as pq
 import pytest
 from helpers import ROOT, make_straight_drive, random_scene
 
-from models.layout import LayoutSpec
 from models.scene import CATEGORIES, UNSET, VEGETATION, VEHICLES, Grid, Scene, make_yaw_rotation
 from pipelines.editing.edit import Remove, Select
 from pipelines.generation.batch_edit import EditRequest, edit_shard
@@ -456,12 +455,12 @@ def test_table_units_match_column_names():
 
 def test_label_scenes_keeps_column_descriptions(root, tmp_path):
     """The function label_scenes, the last step of preprocessing, rewrites the scenes tables."""
-    from pipelines.schema.dataset import Statistics, label_scenes
+    from pipelines.schema.dataset import label_scenes
 
     staged = Shard(f"{root}/real", "town", "train", 0).read("scenes")
     thresholds = compute_density_thresholds(np.arange(4), np.arange(4.0))
     final = str(tmp_path / "final.parquet")
-    storage.write_parquet(label_scenes(staged, Statistics(thresholds, thresholds, LayoutSpec())), final)
+    storage.write_parquet(label_scenes(staged, thresholds, thresholds).cast(SCENES), final)
     assert_columns_are_described(final, SCENES)
 
 
