@@ -295,16 +295,32 @@ class LayoutSpec:
         own = dict(zip(self.categories, self.slots, strict=True))
         if fewer := [name for name, count in zip(other.categories, other.slots, strict=True) if own[name] < count]:
             notes.append(f"{what} has slots for more objects of {', '.join(fewer)}: the farthest ones are left out")
-        shift = self.slab_offset_m - other.slab_offset_m
-        for name, by, meaning in (("height_bounds_m", shift, "ground heights"), ("center_bounds_m", 0.0, "centres")):
-            mine, theirs = getattr(self, name), getattr(other, name)
-            low, high = theirs.low[-1] + by, theirs.high[-1] + by
+        for name, meaning in (("height_bounds_m", "ground heights"), ("center_bounds_m", "centres")):
+            mine, (low, high) = getattr(self, name), self._find_z_range(other, name)
             if low < mine.low[-1] or high > mine.high[-1]:
                 notes.append(
                     f"{what} has z of {meaning} from {low:.3g} to {high:.3g} m, but the bounds of the layout are "
                     f"{mine.low[-1]:.3g} to {mine.high[-1]:.3g} m"
                 )
         return notes
+
+    def covers_heights(self, other: LayoutSpec) -> bool:
+        """Return whether the height bounds contain those of another layout.
+
+        Args:
+            other: Layout of a data set.
+
+        Returns:
+            True if they do.
+        """
+        low, high = self._find_z_range(other, "height_bounds_m")
+        return self.height_bounds_m.low[0] <= low and high <= self.height_bounds_m.high[0]
+
+    def _find_z_range(self, other: LayoutSpec, name: str) -> tuple[float, float]:
+        """Return the bounds of z of another layout (m), with ground heights on the reference surface of this one."""
+        bounds = getattr(other, name)
+        shift = self.slab_offset_m - other.slab_offset_m if name == "height_bounds_m" else 0.0
+        return bounds.low[-1] + shift, bounds.high[-1] + shift
 
     def require(self, other: LayoutSpec, what: str) -> None:
         """Raise an error if another spec differs from this one.

@@ -199,10 +199,12 @@ class LayoutReader:
     Attributes:
         spec: Layout of the model.
         augment: Augmentation. None: the stored scenes are not changed.
+        clip_heights: Whether to clip ground heights to the bounds of the layout.
     """
 
     spec: LayoutSpec
     augment: Augmentation | None = None
+    clip_heights: bool = True
 
     def __call__(self, shard: Shard, rows: np.ndarray, places: np.ndarray | None = None) -> Arrays:
         augment = self.augment
@@ -211,10 +213,10 @@ class LayoutReader:
                 raise ValueError("augmentation needs the position of each sample in the stream")
             scenes = parse_scenes(*_read_tables(shard), shard.source, shard.split, rows.tolist())
             moved = (augment(to_model_surface(s, self.spec), int(k)) for s, k in zip(scenes, places, strict=True))
-            layouts = (encode_layout(scene, self.spec) for scene in moved)
+            layouts = (encode_layout(scene, self.spec, self.clip_heights) for scene in moved)
         else:
             stored = _read_stored_layouts(shard)
-            layouts = (stored.layout(int(row), self.spec) for row in rows)
+            layouts = (stored.layout(int(row), self.spec, self.clip_heights) for row in rows)
         out: Arrays = {}
         for k, layout in enumerate(layouts):
             for name, value in layout.items():
@@ -255,20 +257,21 @@ class StoredLayouts:
         """Return the height of the reference surface of the model above that of these scenes (m)."""
         return find_offset(SURFACE.get(self.source, spec.surface), spec)
 
-    def layout(self, row: int, spec: LayoutSpec) -> Arrays:
+    def layout(self, row: int, spec: LayoutSpec, clip_heights: bool = True) -> Arrays:
         """Encode one scene like `encode_layout`."""
         here = slice(self.first[row], self.first[row] + self.count[row])
         primitives = encode_primitives(self.category[here], self.center_m[here], self.cholesky[here], spec)
-        return self.ground(row, spec) | primitives
+        return self.ground(row, spec, clip_heights) | primitives
 
-    def ground(self, row: int, spec: LayoutSpec) -> Arrays:
+    def ground(self, row: int, spec: LayoutSpec, clip_heights: bool = True) -> Arrays:
         """Encode the ground of one scene. One table, which all scenes share, maps stored heights to encoded heights."""
         raster = {name: self.rasters[name][row].as_py() for name in self.rasters.column_names}
         grid = Grid(raster["front_m"], raster["left_m"], raster["resolution_m"], raster["rows"], raster["cols"])
         classes = raster["ground_classes"]
         steps, mask = list_ground_steps(raster["height"], raster["occupied"], (len(classes), grid.rows, grid.cols))
-        height = np.zeros(mask.shape, np.uint16)
-        height[mask] = _scale_steps(spec, raster["height_step_m"], self.offset_m(spec))[steps.view(np.uint16)]
+        scaled = _scale_steps(spec, raster["height_step_m"], self.offset_m(spec), clip_heights)
+        height = np.zeros(mask.shape, scaled.dtype)
+        height[mask] = scaled[steps.view(np.uint16)]
         if classes != list(spec.ground_classes):
             place = [classes.index(name) if name in classes else -1 for name in spec.ground_classes]
             height, mask = (np.stack([v[k] if k >= 0 else np.zeros_like(v[0]) for k in place]) for v in (height, mask))
@@ -277,10 +280,10 @@ class StoredLayouts:
 
 
 @lru_cache(maxsize=4)
-def _scale_steps(spec: LayoutSpec, step_m: float, offset_m: float) -> np.ndarray:
-    """Return (65536,) uint16: the result of `encode_height` for each 16-bit stored height, plus an offset."""
+def _scale_steps(spec: LayoutSpec, step_m: float, offset_m: float, clip_heights: bool) -> np.ndarray:
+    """Return (65536,) the result of `encode_height` for each 16-bit stored height, plus an offset."""
     steps = np.arange(2**16, dtype=np.uint16).view(np.int16)
-    return encode_height(steps * np.float32(step_m) + np.float32(offset_m), spec)
+    return encode_height(steps * np.float32(step_m) + np.float32(offset_m), spec, clip_heights)
 
 
 @lru_cache(maxsize=CACHED_SHARDS)

@@ -134,6 +134,7 @@ def test_layout_of_a_model_names_what_it_lacks():
     with pytest.raises(ValueError, match="data set 2 covers"):
         LayoutSpec.merge([model, wide])
     hills = replace(model, slots=(9, *model.slots[1:]), height_bounds_m=Bounds((-7,), (0.5,)))
+    assert model.covers_heights(model) and not model.covers_heights(hills)
     few, high = model.require_cover(hills, "/hills")
     assert few == "/hills has slots for more objects of vegetation_cuboid: the farthest ones are left out"
     assert high == "/hills has z of ground heights from -7 to 0.5 m, but the bounds of the layout are -2 to 1 m"
@@ -181,6 +182,19 @@ def test_mixture_names_wrong_options(tmp_path):
     mixture = Mixture.open([town])
     both = Mixture((mixture.datasets[0], replace(mixture.datasets[0], root="/other")), (2.0, 1.0))
     assert both.identity() == {"added_datasets": ["/other"], "dataset_weights": [2.0, 1.0]}
+
+
+@pytest.mark.parametrize("augment", [None, Augmentation(flip=True, move_m=1.0, turn_rad=0.05, seed=1)])
+def test_heights_outside_the_bounds_are_clipped_on_request(layout_shards, augment):
+    spec = replace(small_spec(32), height_bounds_m=Bounds((-0.7,), (-0.4,)))
+    scene = layout_shards[0].scenes([2])[0]
+    rows, places = np.array([2]), np.array([7])
+    clipped, whole = (LayoutReader(spec, augment, clip)(layout_shards[0], rows, places) for clip in (True, False))
+    expected = encode_layout(augment(scene, 7) if augment else scene, spec, clip_heights=False)
+    assert np.abs(whole["height"][0] - expected["height"]).max() <= 1
+    occupied = whole["occupied"]
+    assert clipped["height"][occupied].min() == 0 and clipped["height"][occupied].max() == 65535
+    assert whole["height"][occupied].min() < -1000 and whole["height"][occupied].max() > 66535
 
 
 def test_scenes_of_maps_keep_their_ground_in_a_map_model(map_shards):
