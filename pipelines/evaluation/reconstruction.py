@@ -51,6 +51,7 @@ from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import MAX_RETRIES, flat_map_dataset, make_actor_graph, map_dataset, map_tasks
 from pipelines.runtime.resources import find_device
 from pipelines.schema.dataset import Dataset
+from pipelines.schema.ground_surface import to_model_surface
 from pipelines.schema.run_guard import guard_options
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
@@ -67,7 +68,7 @@ AP_VARIANTS = {
 VOXEL_PX = 256  # Paper, Tab. 1.
 VOXEL_RANGE_M = (VoxelGrid.bottom_m, VoxelGrid.top_m)
 PICTURE_PX = 480
-RECORDS_VERSION = 1  # Version of the records; files with another version are computed again.
+RECORDS_VERSION = 2  # Version of the records; files with another version are computed again.
 SCENE_SCORES = pa.schema(
     [("scene_id", pa.string()), ("primitives", pa.int64()), ("rebuilt_primitives", pa.int64())]
     + [
@@ -111,17 +112,25 @@ class Reconstructor:
     @torch.no_grad()
     def __call__(self, row: dict) -> dict:
         shard, rows = self.chunks[row["id"]]
-        latent = self.model.encode(make_layout_batch(shard.scenes(rows), self.model.spec).to(self.device)).mean
+        scenes = read_model_scenes(shard, rows, self.model.spec)
+        latent = self.model.encode(make_layout_batch(scenes, self.model.spec).to(self.device)).mean
         layouts = self.model.decode(latent).layouts()
         fields = DecodedLayout.__dataclass_fields__
         stacked = {name: np.stack([getattr(layout, name) for layout in layouts]) for name in fields}
         return {"id": row["id"], "latent": latent.float().cpu().numpy()} | stacked
 
 
-def unstack_layouts(row: dict, chunks: list[Chunk]) -> Iterator[tuple[int, Scene, DecodedLayout, np.ndarray]]:
+def read_model_scenes(shard: Shard, rows: list[int], spec: LayoutSpec) -> list[Scene]:
+    """Read scenes, with ground heights on the reference surface of a model."""
+    return [to_model_surface(scene, spec) for scene in shard.scenes(rows)]
+
+
+def unstack_layouts(
+    row: dict, chunks: list[Chunk], spec: LayoutSpec
+) -> Iterator[tuple[int, Scene, DecodedLayout, np.ndarray]]:
     """Yield (row of the shard, true scene, decoded layout, latent) per scene in an output row of a Reconstructor."""
     shard, rows = chunks[row["id"]]
-    for k, (number, scene) in enumerate(zip(rows, shard.scenes(rows), strict=True)):
+    for k, (number, scene) in enumerate(zip(rows, read_model_scenes(shard, rows, spec), strict=True)):
         layout = DecodedLayout(**{name: row[name][k] for name in DecodedLayout.__dataclass_fields__})
         yield number, scene, layout, row["latent"][k]
 
@@ -240,7 +249,7 @@ def score_chunk(
     rows = [
         {"row": number, "scene_id": scene.scene_id}
         | make_scene_record(scene, layout, latent, spec, voxels, dataset, deduplicate, label_threshold).to_row()
-        for number, scene, layout, latent in unstack_layouts(row, chunks)
+        for number, scene, layout, latent in unstack_layouts(row, chunks, spec)
     ]
     storage.write_parquet(pa.Table.from_pylist(rows), make_records_path(directory, row["id"]))
     return {"id": row["id"], "scenes": len(rows)}
@@ -265,7 +274,7 @@ def make_records_path(directory: str, number: int) -> str:
 def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
     """Render each scene in an output row of a Reconstructor as pictures (H, W, 3) uint8 of equal size."""
     out = []
-    for _, scene, layout, _ in unstack_layouts(row, chunks):
+    for _, scene, layout, _ in unstack_layouts(row, chunks, spec):
         sides = {"truth": scene, "rebuilt": decode_layout(layout, spec, scene)}
         above = {f"{name}_above": render_bev(side, PICTURE_PX, supersample=2) for name, side in sides.items()}
         oblique = {f"{name}_oblique": render_3d(side, PICTURE_PX, PICTURE_PX) for name, side in sides.items()}
@@ -495,7 +504,7 @@ def score_ceiling_and_control(
     def score_scenes(number: int) -> int:
         shard, rows = chunks[number]
         found: dict[str, list[dict]] = {name: [] for name in CEILING_AND_CONTROL}
-        for row, scene in zip(rows, shard.scenes(rows), strict=True):
+        for row, scene in zip(rows, read_model_scenes(shard, rows, spec), strict=True):
             moved = damage_scene("moved", scene, scene, (shard.number, row))
             damaged = damage_scene("ground_shifted", moved, moved, (shard.number, row))
             for name, source in zip(CEILING_AND_CONTROL, (scene, damaged), strict=True):

@@ -18,8 +18,10 @@ from pipelines.reporting.evaluation_report import (
     format_value,
     list_headlines,
 )
+from pipelines.schema.attribution import find_attribution
 
-HIDDEN = ("stage", "dataset", "lvae")  # Options that are paths or digests; other parts of the card contain them.
+# Options that are paths or digests; other parts of the card contain them.
+HIDDEN = ("stage", "dataset", "added_datasets", "lvae")
 
 Points = Sequence[Sequence[float]]  # Training steps and loss values.
 
@@ -114,7 +116,7 @@ class ModelCard:
         return "\n".join([*self._head(), *self._training(), *self._scores(), *self._limits(), *self._files()]) + "\n"
 
     def _head(self) -> Iterator[str]:
-        yield "---\nlicense: apache-2.0\nlibrary_name: diffusers"
+        yield f"---\nlicense: {'other' if self._list_notices() else 'apache-2.0'}\nlibrary_name: diffusers"
         yield "tags: [3d, urban-scenes, primitives, layout, diffusion]\n---\n"
         yield f"# PrITTI on Ray: {self.name}\n"
         yield (
@@ -230,11 +232,32 @@ class ModelCard:
         yield from self._describe_deviations()
         yield (
             "The model is intended for research on layouts, for tests of the tools, and as initial weights for "
-            "training on other data. The model is trained only on the dataset above. If this dataset is a procedural "
+            f"training on other data. {self._describe_data()} If this dataset is a procedural "
             "town, the generated scenes do not represent real places. The model is not tested for vehicle safety. "
             "`jobs/edit_scenes.py repair` repairs faults.\n"
         )
-        yield "The licence of weights and code is Apache-2.0.\n"
+        if not (notices := self._list_notices()):
+            yield "The licence of weights and code is Apache-2.0.\n"
+            return
+        yield (
+            "The licence of the code is Apache-2.0. The licences of the training data can limit the use of weights: "
+            f"{'; '.join(notices)}.\n"
+        )
+
+    def _list_added_sources(self) -> list[str]:
+        """Return the sources of the datasets that were mixed with the dataset of the evaluation."""
+        given = [training.options.get("added_sources", "") for training in self.trainings]
+        return list(dict.fromkeys(source for text in given for source in text.split(", ") if source))
+
+    def _list_notices(self) -> list[str]:
+        """Return the licence notices of all training data."""
+        notices = [self.dataset.get("attribution"), *map(find_attribution, self._list_added_sources())]
+        return list(dict.fromkeys(notice for notice in notices if notice))
+
+    def _describe_data(self) -> str:
+        if added := self._list_added_sources():
+            return f"The model is trained on the dataset above, mixed with scenes of the sources {', '.join(added)}."
+        return "The model is trained only on the dataset above."
 
     def _describe_deviations(self) -> Iterator[str]:
         """Yield the categories whose counts differ from the data's by more than 15 %, and the worst label."""

@@ -71,4 +71,5 @@ class Mixture:
         if len(self.datasets) == 1:
             return {}
         added = [dataset.root for dataset in self.datasets[1:]]
-        return {"added_datasets": added, "dataset_weights": list(self.weights)}
+        sources = ", ".join(dataset.source for dataset in self.datasets[1:])
+        return {"added_datasets": added, "added_sources": sources, "dataset_weights": list(self.weights)}

@@ -12,7 +12,9 @@ from models.labels import LABELS
 from models.layout import SLAB_OFFSET_M, Bounds, LayoutSpec
 from models.scene import CATEGORIES
 from models.tensors import encode_layout
+from pipelines.reporting.model_card import ModelCard, TrainingRecord
 from pipelines.runtime import storage
+from pipelines.schema.attribution import ATTRIBUTIONS
 from pipelines.schema.columns import SCENES
 from pipelines.schema.dataset import DENSITY_COLUMNS, label_scenes
 from pipelines.schema.density_labels import DensityThresholds
@@ -181,7 +183,11 @@ def test_mixture_names_wrong_options(tmp_path):
     assert Mixture.open([town]).identity() == {}
     mixture = Mixture.open([town])
     both = Mixture((mixture.datasets[0], replace(mixture.datasets[0], root="/other")), (2.0, 1.0))
-    assert both.identity() == {"added_datasets": ["/other"], "dataset_weights": [2.0, 1.0]}
+    assert both.identity() == {
+        "added_datasets": ["/other"],
+        "added_sources": "town",
+        "dataset_weights": [2.0, 1.0],
+    }
 
 
 @pytest.mark.parametrize("augment", [None, Augmentation(flip=True, move_m=1.0, turn_rad=0.05, seed=1)])
@@ -195,6 +201,24 @@ def test_heights_outside_the_bounds_are_clipped_on_request(layout_shards, augmen
     occupied = whole["occupied"]
     assert clipped["height"][occupied].min() == 0 and clipped["height"][occupied].max() == 65535
     assert whole["height"][occupied].min() < -1000 and whole["height"][occupied].max() > 66535
+
+
+def test_model_card_names_the_licences_of_all_data():
+    run = TrainingRecord("lvae", "lvae", "", None, 1, 0.0, {"dataset": "/a", "added_datasets": "['/b']"}, {}, {}, {})
+    added = {"added_sources": "osm, kitti360", "dataset_weights": "[2.0, 1.0, 1.0]"}
+    mixed = replace(run, options={**run.options, **added})
+    cards = [
+        ModelCard("x", "1", "none", ["any"], [one, run], {}, {"seed": 0, "sampler": "ddim"}, "test", {}, {})
+        for one in (run, mixed)
+    ]
+    assert [card._list_notices() for card in cards] == [[], [ATTRIBUTIONS["osm"], ATTRIBUTIONS["kitti360"]]]
+    assert cards[0]._describe_data() == "The model is trained only on the dataset above."
+    assert "mixed with scenes of the sources osm, kitti360" in cards[1]._describe_data()
+    assert next(cards[0]._head()).startswith("---\nlicense: apache-2.0")
+    assert next(cards[1]._head()).startswith("---\nlicense: other")
+    shown = dict(mixed.rows({}))["options"]
+    assert shown == "added_sources osm, kitti360, dataset_weights [2.0, 1.0, 1.0]"
+    assert not {"dataset", "added_datasets"} & set(mixed.record({})["options"])
 
 
 def test_scenes_of_maps_keep_their_ground_in_a_map_model(map_shards):
