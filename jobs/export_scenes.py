@@ -9,8 +9,8 @@ A GLB file (glTF 2.0) has one named node per primitive. The extras of the node c
 parameters. A PLY file has one mesh with a colour, class id and primitive number per vertex. An NPZ file has 256 x 256 x
 32 voxels with class ids. The jobs import_scenes and evaluate_voxels read such files. An XODR file describes the roads
 for simulators, as OpenDRIVE 1.7 with lanes, elevation and junctions. A GEOJSON file has polygons of the ground and
-outlines of the primitives, seen from above, and so has a GEOPARQUET file. A USD file (extra usd) has one prim per
-primitive.
+outlines of the primitives, seen from above. A GEOPARQUET file contains the same. A USD file (extra usd) has one prim
+per primitive.
 
 Two formats need the table tracks of simulate_traffic.py: XOSC (extra openscenario) describes the traffic and the
 objects of a scene as OpenSCENARIO 1.2 and refers to an XODR file, which is also written. ANIMATION is a GLB file in

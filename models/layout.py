@@ -217,10 +217,10 @@ class LayoutSpec:
 
     @staticmethod
     def merge(specs: Sequence[LayoutSpec]) -> LayoutSpec:
-        """Return the layout that covers the scenes of several data sets.
+        """Return the layout that covers the scenes of several datasets.
 
         Args:
-            specs: Layouts of the data sets. The grid and the reference surface of the first are kept.
+            specs: Layouts of the datasets. The grid and the reference surface of the first are kept.
 
         Returns:
             Layout with the categories and ground classes of all, the largest number of slots per category and the
@@ -230,15 +230,15 @@ class LayoutSpec:
             ValueError: The grids cover different areas.
         """
         first = specs[0]
-        for number, spec in enumerate(specs[1:], 1):
-            first.require_same_area(spec, f"data set {number + 1}")
+        if len(specs) == 1:
+            return first
+        for number, spec in enumerate(specs[1:], 2):
+            first.require_same_area(spec, f"dataset {number}")
+        moved = [spec.with_surface(first.surface) for spec in specs]
 
-        def widest(name: str) -> Bounds:
-            # Heights of another reference surface move with it.
-            shift = [first.slab_offset_m - spec.slab_offset_m if name == "height_bounds_m" else 0.0 for spec in specs]
-            parts = [getattr(spec, name) for spec in specs]
-            low = np.min([np.add(part.low, by) for part, by in zip(parts, shift, strict=True)], axis=0)
-            high = np.max([np.add(part.high, by) for part, by in zip(parts, shift, strict=True)], axis=0)
+        def merge_bounds(name: str) -> Bounds:
+            low = np.min([getattr(spec, name).low for spec in moved], axis=0)
+            high = np.max([getattr(spec, name).high for spec in moved], axis=0)
             return Bounds(tuple(low.tolist()), tuple(high.tolist()))
 
         slots = {
@@ -251,7 +251,7 @@ class LayoutSpec:
             categories=tuple(name for name, count in slots.items() if count >= 0),
             slots=tuple(count for count in slots.values() if count >= 0),
             ground_classes=tuple(name for name in GROUND_CLASSES if name in classes),
-            **{name: widest(name) for name in NUM_BOUNDS},
+            **{name: merge_bounds(name) for name in NUM_BOUNDS},
         )
 
     def require_same_area(self, other: LayoutSpec, what: str) -> None:
@@ -272,14 +272,15 @@ class LayoutSpec:
             )
 
     def require_cover(self, other: LayoutSpec, what: str) -> list[str]:
-        """Raise an error if this layout has no place for the scenes of another one.
+        """Raise an error if this layout cannot represent the scenes of another one.
 
         Args:
-            other: Layout of a data set.
-            what: Name of the data set for messages.
+            other: Layout of a dataset.
+            what: Name of the dataset for messages.
 
         Returns:
-            Notes: values of the data set that this layout clips or leaves out.
+            Notes: objects that this layout leaves out, and values outside its bounds. Positions and sizes of objects
+            are clipped to the bounds.
 
         Raises:
             ValueError: A category or a ground class is missing, or the grids cover different areas.
@@ -295,32 +296,51 @@ class LayoutSpec:
         own = dict(zip(self.categories, self.slots, strict=True))
         if fewer := [name for name, count in zip(other.categories, other.slots, strict=True) if own[name] < count]:
             notes.append(f"{what} has slots for more objects of {', '.join(fewer)}: the farthest ones are left out")
-        for name, meaning in (("height_bounds_m", "ground heights"), ("center_bounds_m", "centres")):
-            mine, (low, high) = getattr(self, name), self._find_z_range(other, name)
-            if low < mine.low[-1] or high > mine.high[-1]:
-                notes.append(
-                    f"{what} has z of {meaning} from {low:.3g} to {high:.3g} m, but the bounds of the layout are "
-                    f"{mine.low[-1]:.3g} to {mine.high[-1]:.3g} m"
-                )
+        theirs = other.with_surface(self.surface)
+        if not self.covers_heights(other):
+            notes.append(
+                f"{what} has ground heights from {theirs.height_bounds_m.low[0]:.3g} to "
+                f"{theirs.height_bounds_m.high[0]:.3g} m, but the bounds of the layout are "
+                f"{self.height_bounds_m.low[0]:.3g} to {self.height_bounds_m.high[0]:.3g} m"
+            )
+        mine, wanted = self.center_bounds_m, theirs.center_bounds_m
+        if wanted.low[2] < mine.low[2] or wanted.high[2] > mine.high[2]:
+            notes.append(
+                f"{what} has centres of objects at z from {wanted.low[2]:.3g} to {wanted.high[2]:.3g} m, but the "
+                f"bounds of the layout are {mine.low[2]:.3g} to {mine.high[2]:.3g} m: z is clipped"
+            )
+        low, high = (np.array(side) for side in (self.cholesky_bounds.low, self.cholesky_bounds.high))
+        margin = 0.02 * (high - low)  # Bounds of equal data also differ a little.
+        low, high = low - margin, high + margin
+        if (np.array(theirs.cholesky_bounds.low) < low).any() or (np.array(theirs.cholesky_bounds.high) > high).any():
+            notes.append(f"{what} has larger or smaller objects than the bounds of the layout: sizes are clipped")
         return notes
 
     def covers_heights(self, other: LayoutSpec) -> bool:
         """Return whether the height bounds contain those of another layout.
 
         Args:
-            other: Layout of a data set.
+            other: Layout of a dataset.
 
         Returns:
             True if they do.
         """
-        low, high = self._find_z_range(other, "height_bounds_m")
-        return self.height_bounds_m.low[0] <= low and high <= self.height_bounds_m.high[0]
+        mine, theirs = self.height_bounds_m, other.with_surface(self.surface).height_bounds_m
+        return mine.low[0] <= theirs.low[0] and theirs.high[0] <= mine.high[0]
 
-    def _find_z_range(self, other: LayoutSpec, name: str) -> tuple[float, float]:
-        """Return the bounds of z of another layout (m), with ground heights on the reference surface of this one."""
-        bounds = getattr(other, name)
-        shift = self.slab_offset_m - other.slab_offset_m if name == "height_bounds_m" else 0.0
-        return bounds.low[-1] + shift, bounds.high[-1] + shift
+    def with_surface(self, surface: str) -> LayoutSpec:
+        """Return the layout of the same scenes with another reference surface of the ground heights.
+
+        Args:
+            surface: Reference surface.
+
+        Returns:
+            Layout with moved height bounds.
+        """
+        other = replace(self, surface=surface)
+        shift = other.slab_offset_m - self.slab_offset_m
+        (low,), (high,) = self.height_bounds_m.low, self.height_bounds_m.high
+        return replace(other, height_bounds_m=Bounds((low + shift,), (high + shift,))) if shift else other
 
     def require(self, other: LayoutSpec, what: str) -> None:
         """Raise an error if another spec differs from this one.

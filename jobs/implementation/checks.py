@@ -87,7 +87,7 @@ def check_train_dit(config: DiTConfig) -> None:
     require_positive(config, "gradient_accumulation_steps")
     if not needs_smoke_inputs(config):
         mixture = open_mixture(config, LVAE_PRESETS[row.lvae].source)
-        resolve_label_kind(config, mixture.datasets[0])
+        resolve_label_kind(config, mixture)
         find_latents(config, mixture)
 
 
@@ -98,26 +98,28 @@ def check_train_street_planner(config: StreetPlannerConfig) -> None:
     require_positive(config, "num_maps")
 
 
-def resolve_label_kind(config: DiTConfig, dataset: Dataset) -> str:
-    """Return --label-kind, or the default for a dataset.
+def resolve_label_kind(config: DiTConfig, mixture: Mixture) -> str:
+    """Return --label-kind, or the default for the datasets.
 
     The paper conditions on vegetation density for KITTI-360 and on vehicle density for Argoverse 2, which has no
     vegetation.
 
     Raises:
-        ValueError: The dataset has no object of a category that the label counts. All scenes would get one label.
+        ValueError: A dataset has no object of a category that the label counts. All its scenes would get one label.
     """
-    lacks = {
-        name
+    used = [one for one, weight in zip(mixture.datasets, mixture.weights, strict=True) if weight > 0]
+    without = {
+        name: [one.root for one in used if not {CATEGORIES[k] for k in group} & set(one.spec.categories)]
         for name, group in DENSITY_GROUPS.items()
-        if not {CATEGORIES[k] for k in group} & set(dataset.spec.categories)
     }
+    lacks = {name for name, roots in without.items() if roots}
     kind = config.label_kind or ("vehicle" if "vegetation" in lacks else "vegetation")
     if missing := lacks & (set(DENSITY_GROUPS) if kind in ("joint", "partial") else {kind}):
         known = [name for name in (*DENSITY_GROUPS, "none") if name not in lacks]
         raise ValueError(
-            f"--label-kind {kind}: {dataset.root} has no objects of the group {' or '.join(sorted(missing))}, so all"
-            f" scenes would have the same label; use --label-kind {' or '.join(known)}"
+            f"--label-kind {kind}: {without[min(missing)][0]} has no objects of the group"
+            f" {' or '.join(sorted(missing))}, so all its scenes would have the same label;"
+            f" use --label-kind {' or '.join(known)}"
         )
     return kind
 
@@ -143,7 +145,7 @@ def find_latents(config: DiTConfig, mixture: Mixture) -> list[str]:
         if digests[-1] != digests[0]:
             raise ValueError(
                 f"{latents} holds latents of another layout VAE than {found[0]}; encode {root} with that layout VAE,"
-                " and name the directory with --add-latents"
+                " and pass the directory with --add-latents"
             )
     return found
 

@@ -9,7 +9,7 @@ from jobs.support.cli import make_absolute
 from jobs.support.outputs import hold_output
 from jobs.support.progress import JobProgress
 from jobs.support.scene_requests import select_scenes
-from pipelines.io.export import TRAFFIC_WRITERS, WRITERS, export_scenes
+from pipelines.io.export import TRAFFIC_WRITERS, WRITERS, export_scenes, uses_traffic
 from pipelines.runtime import storage
 
 
@@ -24,7 +24,7 @@ def export(config: Config) -> tuple[str, dict[str, int], dict[str, str]]:
         raise ValueError(f"--formats is empty, expected one or more of {', '.join((*WRITERS, *TRAFFIC_WRITERS))}")
     selection = select_scenes(config)
     tracks = make_absolute(config.tracks) if config.tracks else selection.root
-    if not TRAFFIC_WRITERS.keys().isdisjoint(config.formats):
+    if uses_traffic(config.formats):
         missing = [
             shard for shard, _ in selection.shards() if not storage.exists(replace(shard, root=tracks).path("tracks"))
         ]
@@ -32,7 +32,7 @@ def export(config: Config) -> tuple[str, dict[str, int], dict[str, str]]:
             shown = replace(missing[0], root=tracks).path("tracks")
             raise ValueError(
                 f"{shown}: no such file. The formats animation and xosc need the table tracks of the scenes; write it "
-                "with jobs/simulate_traffic.py, or name its directory with --tracks"
+                "with jobs/simulate_traffic.py, or pass its directory with --tracks"
             )
     output = make_absolute(config.output) if config.output else storage.join_uri(selection.root, "export")
     total = sum(len(rows) for _, rows in selection.shards())

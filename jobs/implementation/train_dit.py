@@ -69,7 +69,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
         make_smoke_latents(root)
     mixture = open_mixture(config, LVAE_PRESETS[row.lvae].source)
     dataset = mixture.datasets[0]
-    label_kind = resolve_label_kind(config, dataset)
+    label_kind = resolve_label_kind(config, mixture)
     latents_roots = find_latents(config, mixture)
     latents_root = latents_roots[0]
     encoded = [storage.read_json(storage.join_uri(one, "latents.json")) for one in latents_roots]
@@ -98,7 +98,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     stream = mix_streams(make_streams(config, shards, row.batch_size), mixture.weights)
     thresholds = (dataset.vegetation, dataset.vehicle) if config.add_datasets else None
     check_training_labels(stream.shards, label_kind, thresholds)
-    added = {one.root: latents for one, latents in zip(mixture.datasets, latents_roots, strict=True)}
+    latents_of = {one.root: place for one, place in zip(mixture.datasets, latents_roots, strict=True)}
     training = TrainingRun(
         name=name,
         average_with=other.state if other else None,
@@ -106,7 +106,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
         storage_path=home_path("runs"),
         build=partial(build, architecture, settings, execution, row.label_dropout, start, loss_config),
         stream=stream,
-        reader=LatentReader(latents_root, label_kind, row.known_streets_share > 0, added, thresholds),
+        reader=LatentReader(latents_of, label_kind, row.known_streets_share > 0, thresholds),
         settings=settings,
         identity=identity,
         tracker=tracker,

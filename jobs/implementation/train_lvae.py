@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, is_dataclass, replace
 from functools import partial
 from typing import Any
@@ -43,10 +43,10 @@ from models.training import (
 )
 from pipelines.generation.sample import load_pipeline
 from pipelines.runtime import storage
-from pipelines.schema.tables import Shard, find_shards
-from pipelines.training.data_loader import LayoutReader, Stream
+from pipelines.schema.tables import find_shards
+from pipelines.training.data_loader import LayoutReader, Stream, read_samples
 from pipelines.training.latents import digest_weights, load_lvae
-from pipelines.training.mixed_stream import mix_streams
+from pipelines.training.mixed_stream import MixedStream, mix_streams
 
 # Options of the object branch that concern the decoder.
 OF_OBJECT_DECODER = (
@@ -85,7 +85,7 @@ def prepare(config: Config) -> TrainingRun:
     kept = start = None
     spec = mixture.layout.with_resolution(row.raster_px)
     if config.start_from:
-        start = load_start(config.start_from, row.architecture(), None if config.add_datasets else spec)
+        start = load_start(config.start_from, row.architecture(), spec, mixes=bool(config.add_datasets))
         spec = start.spec
     if config.train_object_decoder_of:
         kept = load_kept_weights(
@@ -106,7 +106,7 @@ def prepare(config: Config) -> TrainingRun:
     record = trainer.guard_run_name(name, home_path("runs"), identity)
     tracker = Tracker.start("pritti-lvae", name, identity | {"architecture": row.architecture()}, record)
     execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
-    sample = sample_layouts(stream.shards, stream.counts, spec)
+    sample = sample_layouts(stream, spec)
     return TrainingRun(
         name=name,
         round_weights=config.round_weights,
@@ -234,7 +234,7 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec | None) -
     return Kept(digest_weights(lvae), digest_weights(pipeline.dit), lvae.state_dict(), lvae.spec)
 
 
-def load_start(model: str, architecture: dict, spec: LayoutSpec | None) -> LayoutVAE:
+def load_start(model: str, architecture: dict, spec: LayoutSpec, mixes: bool = False) -> LayoutVAE:
     """Return the trained layout VAE from which a run starts.
 
     The networks of the decoder "cells" do not depend on the number of slots, which may therefore differ.
@@ -242,7 +242,9 @@ def load_start(model: str, architecture: dict, spec: LayoutSpec | None) -> Layou
     Args:
         model: Directory of a layout VAE, or any value that --model accepts.
         architecture: Options of the preset.
-        spec: Layout of the dataset. None: any layout.
+        spec: Layout of the dataset, or of a mixture.
+        mixes: Whether several datasets are mixed. The run then has the layout of the weights, with the slots of the
+            mixture if the decoder is "cells".
 
     Raises:
         ValueError: The networks or the layout differ from those of this run.
@@ -255,8 +257,17 @@ def load_start(model: str, architecture: dict, spec: LayoutSpec | None) -> Layou
                 f"--start-from {model}: its {key} is {built}, but that of this preset is {wanted}; use the preset with"
                 " which it was trained"
             )
-    if spec is None:
-        return lvae
+    if mixes:
+        if lvae.spec.grid != spec.grid:
+            raise ValueError(
+                f"--start-from {model}: its grid is {lvae.spec.grid}, but that of this preset is {spec.grid}; use the "
+                "preset with which it was trained"
+            )
+        own, slots = lvae.spec, dict(zip(spec.categories, spec.slots, strict=True))
+        if lvae.config.objects["decoder"] == "cells":
+            wanted = [max(count, slots.get(name, 0)) for name, count in zip(own.categories, own.slots, strict=True)]
+            own = replace(own, slots=tuple(wanted))
+        spec = own
     may_resize = lvae.config.objects["decoder"] == "cells" and len(lvae.spec.slots) == len(spec.slots)
     own = replace(lvae.spec, slots=spec.slots) if may_resize else lvae.spec
     own.require(spec, f"the dataset of this run, which continues {model},")
@@ -320,13 +331,15 @@ def write_updated_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
     return output
 
 
-def sample_layouts(shards: Sequence[Shard], counts: Sequence[int], spec: LayoutSpec) -> dict:
+def sample_layouts(stream: Stream | MixedStream, spec: LayoutSpec) -> dict:
     """Return compact layouts of up to START_SCENES training scenes for `init_from_data`.
 
-    The scenes are selected evenly from the dataset.
+    The scenes are selected evenly from a dataset. Those of a mixture are the first samples of the training.
     """
-
     read, parts = LayoutReader(spec), []
+    if isinstance(stream, MixedStream):
+        return read_samples(stream, read, 0, 1, START_SCENES, 0, 1)
+    shards, counts = stream.shards, stream.counts
     for k in np.unique(np.linspace(0, len(shards) - 1, START_SHARDS).round().astype(int)):
         take = min(counts[k], START_SCENES // START_SHARDS)
         parts.append(read(shards[k], np.linspace(0, counts[k] - 1, take).round().astype(int)))

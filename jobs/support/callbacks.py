@@ -29,6 +29,7 @@ from pipelines.metrics.reconstruction import (
     sum_ground,
 )
 from pipelines.rendering.render import arrange_contact_sheet, render_bev
+from pipelines.schema.ground_surface import to_model_surface
 from pipelines.schema.tables import Shard, find_shards, read_scenes
 from pipelines.training.data_loader import LatentReader
 from pipelines.training.latents import load_lvae
@@ -71,7 +72,7 @@ class ReconstructionCheck:
         )
         spec, sums, losses, rebuilt, matches, pairs = model.spec, [], [], [], [], []
         for start in range(0, len(scenes), self.batch):
-            chosen = scenes[start : start + self.batch]
+            chosen = [to_model_surface(scene, spec) for scene in scenes[start : start + self.batch]]
             batch = make_layout_batch(chosen, spec).to(trainer.device)
             generators = [make_keyed_generator(0, start + k) for k in range(len(chosen))]
             (noise,) = sample_noise(generators, model.latent_shape, trainer.device)
@@ -198,7 +199,7 @@ def load_held_out_latents(
         shards = find_shards(root, source=source, split="test")
     except ValueError:
         shards = find_shards(root, source=source, split="train")
-    read, parts, left = LatentReader(latents, label, streets), [], count
+    read, parts, left = LatentReader({root: latents}, label, streets), [], count
     for shard in shards:
         rows = np.arange(min(left, shard.read("scenes", ["scene_id"]).num_rows))
         parts.append(read(shard, rows))

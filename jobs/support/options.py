@@ -42,15 +42,15 @@ PagScaleOption = Annotated[
 AddDatasetsOption = Annotated[
     tuple[str, ...],
     tyro.conf.arg(
-        help="Further dataset directories to train on. The layout covers all datasets, or is that of the model with"
-        " which training starts (default: none)."
+        help="Further dataset directories to train on. The layout covers all datasets; with --start-from, it is that of"
+        " the start model (default: none)."
     ),
 ]
 DatasetWeightsOption = Annotated[
     tuple[float, ...],
     tyro.conf.arg(
-        help="Share of the samples from --dataset and from each of --add-datasets, up to a common factor; with 0, a"
-        " dataset only widens the layout (default: equal shares)."
+        help="Relative sampling weights of --dataset and of each of --add-datasets. A dataset with weight 0 is not"
+        " sampled; in train_lvae, it widens the layout (default: equal)."
     ),
 ]
 GpusOption = Annotated[

@@ -1,4 +1,4 @@
-"""Tell parked vehicles of a scene from vehicles in traffic."""
+"""Distinguish parked vehicles from vehicles in traffic."""
 
 from __future__ import annotations
 

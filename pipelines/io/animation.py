@@ -24,8 +24,8 @@ def export_animation(scene: Scene, tracks: pa.Table) -> bytes:
     """Export a scene and its traffic to a binary glTF 2.0 file with one animation.
 
     The file is that of `export_glb` without the vehicles in traffic, which the simulated traffic replaces. In addition,
-    each road user has a node `road_user_<object_id>`, whose extras hold category, object id and size. Its scale is 0
-    before its first and after its last time, and in viewers without animation.
+    each road user has a node `road_user_<object_id>`, whose extras hold category, object id and size. The scale of the
+    node is 0 before the first time, from one time step after the last, and in viewers without animation.
 
     Args:
         scene: Scene.
@@ -40,18 +40,14 @@ def export_animation(scene: Scene, tracks: pa.Table) -> bytes:
     users = list_road_users(tracks)
     if not users:
         raise ValueError(f"scene {scene.scene_id} has no traffic to export")
-    world = build_world(scene.select(~find_driving_vehicles(scene)))
+    world = build_world(scene, find_driving_vehicles(scene))
     for user in users:
         if user.category not in world.geometry:
             world.geometry[user.category] = make_unit_mesh(CATEGORY_INDEX[user.category])
         extras = {"category": user.category, "object_id": user.object_id, "size_m": user.size_m.tolist()}
-        world.graph.update(_name_node(user), "scene", matrix=np.eye(4), geometry=user.category, metadata=extras)
+        world.graph.update(user.name, "scene", matrix=np.eye(4), geometry=user.category, metadata=extras)
     content = trimesh.exchange.gltf.export_glb(world, tree_postprocessor=lambda t: complete_tree(scene.attribution, t))
     return _add_animation(content, users)
-
-
-def _name_node(user: RoadUser) -> str:
-    return f"road_user_{user.object_id:04d}"
 
 
 def _add_animation(content: bytes, users: list[RoadUser]) -> bytes:
@@ -79,7 +75,7 @@ def _add_animation(content: bytes, users: list[RoadUser]) -> bytes:
     samplers, channels = [], []
     step_s = find_time_step(users)
     for user in users:
-        target = nodes[_name_node(user)]
+        target = nodes[user.name]
         rotation = _make_quaternions(user.yaw_rad)
         place = {"translation": user.center_m[0], "rotation": rotation[0], "scale": np.zeros(3)}
         tree["nodes"][target].pop("matrix", None)

@@ -21,8 +21,9 @@ from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_tasks
 from pipelines.schema.conversion import make_rejects_table
 from pipelines.schema.file_names import make_file_name
+from pipelines.schema.run_guard import guard_options
 from pipelines.schema.scene_subset import SceneSubset
-from pipelines.schema.tables import Shard
+from pipelines.schema.tables import Shard, find_shards
 from pipelines.schema.tracks import read_tracks, select_tracks
 
 Format = Literal["glb", "ply", "npz", "xodr", "geojson", "geoparquet", "usd", "animation", "xosc"]
@@ -87,19 +88,22 @@ def export_scenes(
     """
     formats = list(dict.fromkeys([*(["xodr"] if "xosc" in formats else []), *formats]))
     parts = selection.shards()
-    there = set() if overwrite else list_exported(output, formats)
+    there = set() if overwrite else list_exported_files(output, formats)
+    if uses_traffic(formats):
+        guard_tracks(selection, formats, output, tracks, overwrite)
 
     def export_shard(number: int) -> dict:
         shard, rows = parts[number]
         written, rejects, paths = [], [], []
         notices: set[str] = set()
-        traffic = None
-        if not TRAFFIC_WRITERS.keys().isdisjoint(formats):
-            traffic = read_tracks(replace(shard, root=tracks or shard.root))
+        traffic = read_tracks(replace(shard, root=tracks or shard.root)) if uses_traffic(formats) else None
         for scene in shard.scenes(rows):
+            failed: set[str] = set()
             for kind in formats:
                 path = storage.join_uri(output, kind, f"{make_file_name(scene.scene_id)}.{find_extension(kind)}")
                 try:
+                    if kind == "xosc" and "xodr" in failed:
+                        raise ValueError("the scene has no OpenDRIVE file, to which the scenario would refer")
                     if path not in there:
                         if traffic is not None and kind in TRAFFIC_WRITERS:
                             content = TRAFFIC_WRITERS[kind](scene, select_tracks(traffic, scene.scene_id))
@@ -110,6 +114,7 @@ def export_scenes(
                     written.append(kind)
                     paths.append(path)
                 except ValueError as error:
+                    failed.add(kind)
                     about = {"scene_id": scene.scene_id, "sequence": scene.sequence, "frame": scene.frame}
                     rejects.append(about | {"reason": f"{kind}: {error}"})
         if rejects:
@@ -127,18 +132,58 @@ def export_scenes(
             counts[kind] += 1
         promised += row["paths"]
         notices.update(row["notices"])
-        refused |= {scene_id: reason for scene_id, reason in row["rejects"]}
+        for scene_id, reason in row["rejects"]:
+            refused[scene_id] = f"{refused[scene_id]}; {reason}" if scene_id in refused else reason
         if on_scene:
             on_scene(row["scenes"])
     if notices:
         text = "".join(f"{notice}\n" for notice in sorted(notices)).encode()
         storage.write_whole(storage.join_uri(output, NOTICE), lambda stream: stream.write(text))
-    there = list_exported(output, formats)
+    there = list_exported_files(output, formats)
     storage.raise_faults({path: f"{path}: no such file" for path in promised if path not in there}, len(promised))
     return counts, refused
 
 
-def list_exported(output: str, formats: Sequence[Format]) -> set[str]:
+def uses_traffic(formats: Sequence[str]) -> bool:
+    """Return whether some formats need the table tracks.
+
+    Args:
+        formats: File formats.
+
+    Returns:
+        True if one of the formats needs the table.
+    """
+    return not TRAFFIC_WRITERS.keys().isdisjoint(formats)
+
+
+def guard_tracks(selection: SceneSubset, formats: Sequence[Format], output: str, tracks: str, overwrite: bool) -> None:
+    """Record which tracks the files of an output directory show.
+
+    Args:
+        selection: Scenes.
+        formats: File formats.
+        output: Output directory.
+        tracks: Dataset directory with the table tracks (default: that of the scenes).
+        overwrite: Whether existing files are replaced.
+
+    Raises:
+        ValueError: Existing files show other tracks.
+    """
+    shards = find_shards(tracks or selection.root, "tracks")
+    files = storage.fingerprint_files([shard.path("tracks") for shard in shards])
+    kept: list[Format] = [] if overwrite else [kind for kind in formats if kind in TRAFFIC_WRITERS]
+    guard_options(
+        storage.join_uri(output, "tracks.json"),
+        {"tracks": files},
+        is_in_use=lambda: bool(list_exported_files(output, kept)),
+        discard=lambda: None,
+        describe=lambda difference: (
+            f"{output} holds files that show other tracks; add --overwrite or choose another --output"
+        ),
+    )
+
+
+def list_exported_files(output: str, formats: Sequence[Format]) -> set[str]:
     """List the files of some formats in an output directory.
 
     Args:

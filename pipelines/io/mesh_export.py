@@ -212,11 +212,12 @@ def export_glb(scene: Scene) -> bytes:
     return trimesh.exchange.gltf.export_glb(world, tree_postprocessor=partial(complete_tree, scene.attribution))
 
 
-def build_world(scene: Scene) -> trimesh.Scene:
+def build_world(scene: Scene, hidden: np.ndarray | None = None) -> trimesh.Scene:
     """Build the nodes and meshes that `export_glb` writes.
 
     Args:
         scene: Scene.
+        hidden: (n,) bool mask of primitives to leave out (default: none).
 
     Returns:
         Graph with the node `scene`, and a geometry for the ground and for each category.
@@ -231,9 +232,10 @@ def build_world(scene: Scene) -> trimesh.Scene:
         world.geometry["ground"] = _paint_mesh(vertices, triangles, class_id)
         extras = {"classes": {name: f"#{COLOR_HEX[name]}" for name in scene.ground_classes}}
         world.graph.update("ground", "scene", matrix=np.eye(4), geometry="ground", metadata=extras)
-    for category in np.unique(scene.category):
+    shown = np.arange(len(scene)) if hidden is None else np.flatnonzero(~hidden)
+    for category in np.unique(scene.category[shown]):
         world.geometry[CATEGORIES[category]] = make_unit_mesh(category)
-    for index, transform in enumerate(compute_placements(scene)):
+    for index, transform in zip(shown.tolist(), compute_placements(scene)[shown], strict=True):
         name = CATEGORIES[scene.category[index]]
         node = f"{name}_{index:04d}"
         world.graph.update(node, "scene", matrix=transform, geometry=name, metadata=_make_extras(scene, index))

@@ -107,7 +107,7 @@ def import_glb(
 
 def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     about = _read_metadata(glb.extras)
-    parts = [part for part in glb.parts if "object_id" not in part.extras]  # Traffic is no part of the scene.
+    parts = [part for part in glb.parts if "object_id" not in part.extras]  # Road users are not part of the scene.
     _check_parts(parts, about["ground_classes"])
     for node, extras in glb.bare:
         if named := {"category", "classes"} & extras.keys():

@@ -22,6 +22,7 @@ from scipy.interpolate import CubicSpline
 from models.scene import ROAD_CLASSES, Grid, Scene
 from pipelines.geometry.centerlines import Road, RoadNetwork, extract_road_network
 from pipelines.geometry.ground_polygons import build_ground_polygons
+from pipelines.schema.file_names import clean_xml_text
 
 KNOT_M = 5.0  # Distance between points of a reference line.
 LANE_M = 3.5  # Approximate lane width, which determines the number of lanes per side.
@@ -243,7 +244,13 @@ def export_opendrive(scene: Scene) -> bytes:
 def _make_header(root: ET.Element, scene: Scene) -> None:
     grid = scene.grid
     borders = {"north": grid.left_m, "south": grid.right_m, "east": grid.front_m, "west": grid.back_m}
-    about = {"revMajor": "1", "revMinor": "7", "name": scene.scene_id, "version": "1.00", "vendor": "PrITTI on Ray"}
+    about = {
+        "revMajor": "1",
+        "revMinor": "7",
+        "name": clean_xml_text(scene.scene_id),
+        "version": "1.00",
+        "vendor": "PrITTI on Ray",
+    }
     header = ET.SubElement(root, "header", about | {name: _format_number(value) for name, value in borders.items()})
     x, y, z = scene.world_xyz_m
     ET.SubElement(
@@ -255,7 +262,7 @@ def _make_header(root: ET.Element, scene: Scene) -> None:
         hdg=_format_number(scene.world_yaw_rad),
     )
     if scene.attribution:
-        ET.SubElement(header, "userData", code="attribution", value=scene.attribution)
+        ET.SubElement(header, "userData", code="attribution", value=clean_xml_text(scene.attribution))
 
 
 def _format_number(value: float) -> str:

@@ -1,8 +1,8 @@
 """Export a Scene with its traffic as ASAM OpenSCENARIO XML 1.2, next to its roads as OpenDRIVE.
 
 Coordinates are in the inertial frame of the OpenDRIVE file, which is the scene frame. The reference point of a vehicle
-is the middle of its rear axle on the ground, that of all other entities is the middle of their base. The package
-scenariogeneration (extra `openscenario`) writes the elements.
+is the middle of its rear axle on the ground. The reference point of any other entity is the middle of its base. The
+package scenariogeneration (extra `openscenario`) writes the elements.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+from scipy.spatial.transform import Rotation
 
-from models.scene import CATEGORIES, Scene
+from models.scene import CATEGORIES, Scene, make_yaw_rotation
 from pipelines.geometry.parked_vehicles import find_driving_vehicles
+from pipelines.schema.file_names import clean_xml_text
 from pipelines.schema.tracks import RoadUser, find_time_step, list_road_users
 
 MINOR_VERSION = 2
@@ -84,26 +86,26 @@ def export_openscenario(scene: Scene, tracks: pa.Table, roads: str) -> bytes:
     xosc.VersionBase().setVersion(minor=MINOR_VERSION)
     entities, init = xosc.Entities(), xosc.Init()
     lift_m = np.array([0.0, 0.0, _measure_lift(scene, users)])
-    for index in np.flatnonzero(~find_driving_vehicles(scene)):
+    for index in np.flatnonzero(~find_driving_vehicles(scene)).tolist():
         category = CATEGORIES[scene.category[index]]
         name = f"{category}_{index:05d}"
-        heading = float(scene.heading_rad[index])
-        yaw_rad = heading if np.isfinite(heading) else float(scene.yaw_rad[index])
+        rotation = _turn_ahead(scene, index)
         entities.add_scenario_object(name, _make_entity(xosc, category, scene.size_m[index]))
-        place = _find_reference(category, scene.size_m[index], scene.center_m[index], np.array(yaw_rad)) + lift_m
-        init.add_init_action(name, xosc.TeleportAction(_make_position(xosc, place, yaw_rad)))
-    act = xosc.Act("traffic", _at_time(xosc, "start of traffic", 0.0))
+        place_m = _find_reference(category, scene.size_m[index], scene.center_m[index], rotation) + lift_m
+        angles_rad = Rotation.from_matrix(rotation).as_euler("ZYX")
+        init.add_init_action(name, xosc.TeleportAction(_make_position(xosc, place_m, *angles_rad)))
+    act = xosc.Act("traffic", _make_time_trigger(xosc, "start of traffic", 0.0))
     step_s = find_time_step(users)
     for user in users:
         user = user._replace(center_m=user.center_m + lift_m)
-        name = f"road_user_{user.object_id:05d}"
+        name = user.name
         entities.add_scenario_object(name, _make_entity(xosc, user.category, user.size_m))
-        act.add_maneuver_group(_make_drive(xosc, name, user, float(user.time_s[-1]) + step_s))
+        act.add_maneuver_group(_make_maneuver_group(xosc, name, user, float(user.time_s[-1]) + step_s))
     end_s = max(float(user.time_s[-1]) for user in users) + 2 * step_s
-    storyboard = xosc.StoryBoard(init, _at_time(xosc, "end of traffic", end_s, "stop"))
+    storyboard = xosc.StoryBoard(init, _make_time_trigger(xosc, "end of traffic", end_s, "stop"))
     storyboard.add_act(act)
     scenario = xosc.Scenario(
-        scene.scene_id,
+        f"Scene {scene.scene_id}",
         "PrITTI on Ray",
         xosc.ParameterDeclarations(),
         entities,
@@ -115,6 +117,9 @@ def export_openscenario(scene: Scene, tracks: pa.Table, roads: str) -> bytes:
         creation_date=DATE,
     )
     root = scenario.get_element()
+    for element in root.iter():
+        for key, value in element.attrib.items():
+            element.set(key, clean_xml_text(str(value)))
     ET.indent(root)
     return ET.tostring(root, encoding="utf-8", xml_declaration=True)
 
@@ -134,16 +139,28 @@ def _measure_lift(scene: Scene, users: list[RoadUser]) -> float:
     return float(np.median(height_m[row, col][known] - base_m[known])) if known.any() else 0.0
 
 
-def _find_reference(category: str, size_m: np.ndarray, center_m: np.ndarray, yaw_rad: np.ndarray) -> np.ndarray:
-    """Return the reference points (..., 3) of an entity from its centres (..., 3) and directions (...)."""
-    back_m = REAR_AXLE * float(size_m[0]) if KINDS[category].entity == "Vehicle" else 0.0
-    ahead = np.stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros_like(yaw_rad)], axis=-1)
-    return np.asarray(center_m, float) + back_m * ahead - [0.0, 0.0, float(size_m[2]) / 2]
+def _turn_ahead(scene: Scene, index: int) -> np.ndarray:
+    """Return the rotation (3, 3) of a primitive, with its length axis ahead rather than back.
+
+    The heading of some objects, such as signs of Argoverse 2, is across their length. Their length axis is kept.
+    """
+    rotation = scene.rotation[index].astype(float)
+    heading_rad = float(scene.heading_rad[index])
+    if np.isfinite(heading_rad) and np.cos(heading_rad - float(scene.yaw_rad[index])) < -1e-6:
+        return rotation * [-1.0, -1.0, 1.0]
+    return rotation
 
 
-def _make_position(xosc: Any, place_m: np.ndarray, yaw_rad: float) -> Any:
+def _find_reference(category: str, size_m: np.ndarray, center_m: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Return the reference points (..., 3) of an entity from its centres (..., 3) and rotations (..., 3, 3)."""
+    length_m, _, height_m = (float(value) for value in size_m)
+    ahead_m = -REAR_AXLE * length_m if KINDS[category].entity == "Vehicle" else 0.0
+    return np.asarray(center_m, float) - rotation @ np.array([ahead_m, 0.0, height_m / 2])
+
+
+def _make_position(xosc: Any, place_m: np.ndarray, heading_rad: float, pitch_rad: float, roll_rad: float) -> Any:
     x, y, z = (round(float(value), 4) for value in place_m)
-    return xosc.WorldPosition(x, y, z, round(float(yaw_rad), 5), 0, 0)
+    return xosc.WorldPosition(x, y, z, *(round(float(angle), 5) for angle in (heading_rad, pitch_rad, roll_rad)))
 
 
 def _make_entity(xosc: Any, category: str, size_m: np.ndarray) -> Any:
@@ -165,23 +182,23 @@ def _make_entity(xosc: Any, category: str, size_m: np.ndarray) -> Any:
     return xosc.MiscObject(category, mass_kg, getattr(xosc.MiscObjectCategory, kind.category), box)
 
 
-def _at_time(xosc: Any, name: str, time_s: float, point: str = "start") -> Any:
+def _make_time_trigger(xosc: Any, name: str, time_s: float, point: str = "start") -> Any:
     condition = xosc.SimulationTimeCondition(round(time_s, 4), xosc.Rule.greaterOrEqual)
     return xosc.ValueTrigger(name, 0, xosc.ConditionEdge.none, condition, triggeringpoint=point)
 
 
-def _make_drive(xosc: Any, name: str, user: RoadUser, end_s: float) -> Any:
+def _make_maneuver_group(xosc: Any, name: str, user: RoadUser, end_s: float) -> Any:
     """Return the maneuver group in which a road user appears, follows its trajectory and disappears."""
-    places_m = _find_reference(user.category, user.size_m, user.center_m, user.yaw_rad)
+    places_m = _find_reference(user.category, user.size_m, user.center_m, make_yaw_rotation(user.yaw_rad.astype(float)))
     headings_rad = np.unwrap(user.yaw_rad)
-    positions = [_make_position(xosc, place, yaw) for place, yaw in zip(places_m, headings_rad, strict=True)]
+    positions = [_make_position(xosc, place, yaw, 0, 0) for place, yaw in zip(places_m, headings_rad, strict=True)]
     maneuver = xosc.Maneuver(f"drive of {name}")
 
     def add_event(what: str, time_s: float, *actions: Any) -> None:
         event = xosc.Event(f"{name} {what}", xosc.Priority.parallel)
         for number, action in enumerate(actions):
             event.add_action(f"{name} {what} {number}", action)
-        event.add_trigger(_at_time(xosc, f"time of {name} {what}", time_s))
+        event.add_trigger(_make_time_trigger(xosc, f"time of {name} {what}", time_s))
         maneuver.add_event(event)
 
     start_s = float(user.time_s[0])

@@ -18,10 +18,9 @@ from pipelines.reporting.evaluation_report import (
     format_value,
     list_headlines,
 )
-from pipelines.schema.attribution import find_attribution
 
 # Options that are paths or digests; other parts of the card contain them.
-HIDDEN = ("stage", "dataset", "added_datasets", "lvae")
+HIDDEN = ("stage", "dataset", "added_datasets", "added_notices", "lvae")
 
 Points = Sequence[Sequence[float]]  # Training steps and loss values.
 
@@ -232,7 +231,7 @@ class ModelCard:
         yield from self._describe_deviations()
         yield (
             "The model is intended for research on layouts, for tests of the tools, and as initial weights for "
-            f"training on other data. {self._describe_data()} If this dataset is a procedural "
+            f"training on other data. {self._describe_data()} If the dataset above is a procedural "
             "town, the generated scenes do not represent real places. The model is not tested for vehicle safety. "
             "`jobs/edit_scenes.py repair` repairs faults.\n"
         )
@@ -251,7 +250,8 @@ class ModelCard:
 
     def _list_notices(self) -> list[str]:
         """Return the licence notices of all training data."""
-        notices = [self.dataset.get("attribution"), *map(find_attribution, self._list_added_sources())]
+        added = [training.options.get("added_notices", "") for training in self.trainings]
+        notices = [self.dataset.get("attribution"), *(notice for text in added for notice in text.split("; "))]
         return list(dict.fromkeys(notice for notice in notices if notice))
 
     def _describe_data(self) -> str:

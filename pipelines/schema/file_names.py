@@ -1,4 +1,4 @@
-"""Convert untrusted ids of tables to safe names of files and directories."""
+"""Convert untrusted texts of tables to safe names of files and directories, and to text for XML files."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 
 MAX_CHARACTERS = 120  # A name has at most this length before its suffix. File systems allow 255 bytes.
 UNSAFE = re.compile(r"[^A-Za-z0-9._+=@,-]")
+NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # Characters that XML 1.0 forbids.
 
 
 def make_file_name(name: str) -> str:
@@ -26,3 +27,15 @@ def make_file_name(name: str) -> str:
         return name
     kept = UNSAFE.sub("-", name)[:MAX_CHARACTERS].lstrip(".")
     return f"{kept or 'unnamed'}~{hashlib.sha256(name.encode('utf-8', 'surrogatepass')).hexdigest()[:12]}"
+
+
+def clean_xml_text(text: str) -> str:
+    """Replace the characters that XML 1.0 forbids, such as control characters.
+
+    Args:
+        text: Text from a table.
+
+    Returns:
+        Text that an XML file can hold; each forbidden character is replaced by U+FFFD.
+    """
+    return NOT_XML.sub("\ufffd", text)

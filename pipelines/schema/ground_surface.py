@@ -14,20 +14,21 @@ from models.scene import Scene
 SURFACE = {"town": "top", "kitti360": "top"} | dict.fromkeys(("av2", "osm", "opendrive", "own", "py123d"), "surface")
 
 
-def find_surface(scene: Scene, default: str) -> str:
+def find_surface(source: str, scene_id: str, default: str) -> str:
     """Return the surface to which the ground heights of a scene refer.
 
     Args:
-        scene: Scene. Edited scenes keep the id of the scene that was edited, which begins with its source.
+        source: Source of the scene.
+        scene_id: Id of the scene. Edited scenes keep the id of the scene that was edited, which begins with its source.
         default: Surface of other scenes, such as generated ones.
 
     Returns:
         "top" or "surface" (SURFACE).
     """
-    return SURFACE.get(scene.source) or SURFACE.get(scene.scene_id.partition("-")[0], default)
+    return SURFACE.get(source) or SURFACE.get(scene_id.partition("-")[0], default)
 
 
-def find_offset(surface: str, spec: LayoutSpec) -> float:
+def find_surface_offset(surface: str, spec: LayoutSpec) -> float:
     """Return the height of the reference surface of a model above another surface.
 
     Args:
@@ -50,7 +51,7 @@ def to_model_surface(scene: Scene, spec: LayoutSpec) -> Scene:
     Returns:
         The same scene, or a scene whose ground is higher or lower by SLAB_OFFSET_M.
     """
-    return _raise_ground(scene, find_offset(find_surface(scene, spec.surface), spec))
+    return _raise_ground(scene, find_surface_offset(find_surface(scene.source, scene.scene_id, spec.surface), spec))
 
 
 def from_model_surface(scene: Scene, given: Scene, spec: LayoutSpec) -> Scene:
@@ -64,7 +65,7 @@ def from_model_surface(scene: Scene, given: Scene, spec: LayoutSpec) -> Scene:
     Returns:
         The scene.
     """
-    return _raise_ground(scene, -find_offset(find_surface(given, spec.surface), spec))
+    return _raise_ground(scene, -find_surface_offset(find_surface(given.source, given.scene_id, spec.surface), spec))
 
 
 def _raise_ground(scene: Scene, offset_m: float) -> Scene:

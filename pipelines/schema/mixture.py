@@ -8,6 +8,7 @@ import numpy as np
 
 from models.layout import LayoutSpec
 from pipelines.schema.dataset import Dataset
+from pipelines.schema.tables import find_shards
 
 
 @dataclass(frozen=True)
@@ -15,10 +16,9 @@ class Mixture:
     """Datasets that a training run uses together.
 
     Attributes:
-        datasets: Datasets. The first decides about labels and reference surface, and provides the scenes for
+        datasets: Datasets. The first defines label thresholds and reference surface, and provides the scenes for
             validation.
-        weights: Share of the samples from each dataset, up to a common factor. A dataset with weight 0 only widens the
-            layout.
+        weights: Relative sampling weights. A dataset with weight 0 is not sampled; it only widens the layout.
     """
 
     datasets: tuple[Dataset, ...]
@@ -30,7 +30,7 @@ class Mixture:
 
         Args:
             roots: Dataset directories.
-            weights: Share of the samples from each dataset (default: equal shares).
+            weights: Relative sampling weights (default: equal).
 
         Returns:
             The mixture.
@@ -38,6 +38,7 @@ class Mixture:
         Raises:
             ValueError: A dataset is incomplete or is given twice, or the weights are invalid.
         """
+        roots = [root.rstrip("/") for root in roots]
         if twice := [root for root in set(roots) if roots.count(root) > 1]:
             raise ValueError(f"{twice[0]} is given twice; use --dataset-weights to sample it more often")
         weights = weights or (1.0,) * len(roots)
@@ -70,6 +71,14 @@ class Mixture:
         """Return the options that must not change when a run is resumed; empty for a single dataset."""
         if len(self.datasets) == 1:
             return {}
-        added = [dataset.root for dataset in self.datasets[1:]]
-        sources = ", ".join(dataset.source for dataset in self.datasets[1:])
-        return {"added_datasets": added, "added_sources": sources, "dataset_weights": list(self.weights)}
+        used = [dataset for dataset, weight in zip(self.datasets[1:], self.weights[1:], strict=True) if weight > 0]
+        shards = [shard for one in used for shard in find_shards(one.root, source=one.source, split="train")]
+        notices = {
+            notice for shard in shards for notice in shard.read("scenes", ["attribution"])["attribution"].to_pylist()
+        }
+        return {
+            "added_datasets": [dataset.root for dataset in self.datasets[1:]],
+            "added_sources": ", ".join(dataset.source for dataset in used),
+            "added_notices": "; ".join(sorted(notice for notice in notices if notice)),
+            "dataset_weights": list(self.weights),
+        }

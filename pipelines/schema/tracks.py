@@ -34,6 +34,11 @@ class RoadUser(NamedTuple):
     yaw_rad: np.ndarray
     speed_mps: np.ndarray
 
+    @property
+    def name(self) -> str:
+        """Name of the road user in exported files."""
+        return f"road_user_{self.object_id}"
+
 
 def read_tracks(shard: Shard) -> pa.Table:
     """Read the trajectories of all scenes of a shard.

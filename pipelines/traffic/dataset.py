@@ -57,7 +57,7 @@ class TrafficRequest:
         """
         if self.slab_offset_m is not None:
             return self.slab_offset_m
-        return SLAB_OFFSET_M if find_surface(scene, "top") == "top" else 0.0
+        return SLAB_OFFSET_M if find_surface(scene.source, scene.scene_id, "top") == "top" else 0.0
 
 
 class Part(NamedTuple):

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
 from typing import Protocol, cast
@@ -31,7 +31,7 @@ from models.tensors import encode_height, encode_layout, encode_primitives, resa
 from pipelines.schema.conversion import find_category_indices, list_ground_steps, parse_scenes, read_fixed_lists
 from pipelines.schema.dataset import DENSITY_COLUMNS, label_scenes
 from pipelines.schema.density_labels import DensityThresholds
-from pipelines.schema.ground_surface import SURFACE, find_offset, to_model_surface
+from pipelines.schema.ground_surface import find_surface, find_surface_offset, to_model_surface
 from pipelines.schema.tables import Shard
 from pipelines.schema.validation import validate_shard
 
@@ -48,7 +48,7 @@ Reader = Callable[[Shard, np.ndarray, np.ndarray], Arrays]  # (Shard, rows, posi
 
 
 class SampleOrder(Protocol):
-    """The endless, seeded order of training samples: `Stream`, or `MixedStream` of mixture.py."""
+    """The endless, seeded order of training samples: `Stream`, or `MixedStream` of mixed_stream.py."""
 
     @property
     def shards(self) -> tuple[Shard, ...]: ...
@@ -242,7 +242,8 @@ class StoredLayouts:
         center_m: (n, 3) centre of each primitive (m, scene frame).
         cholesky: (n, 6) Cholesky parameters of each primitive.
         rasters: Rasters table.
-        source: Source of the scenes, which determines their reference surface.
+        source: Source of the scenes.
+        scene_ids: Ids of the scenes. Source and ids determine the reference surface.
     """
 
     first: np.ndarray
@@ -252,10 +253,7 @@ class StoredLayouts:
     cholesky: np.ndarray
     rasters: pa.Table
     source: str
-
-    def offset_m(self, spec: LayoutSpec) -> float:
-        """Return the height of the reference surface of the model above that of these scenes (m)."""
-        return find_offset(SURFACE.get(self.source, spec.surface), spec)
+    scene_ids: list[str]
 
     def layout(self, row: int, spec: LayoutSpec, clip_heights: bool = True) -> Arrays:
         """Encode one scene like `encode_layout`."""
@@ -269,7 +267,8 @@ class StoredLayouts:
         grid = Grid(raster["front_m"], raster["left_m"], raster["resolution_m"], raster["rows"], raster["cols"])
         classes = raster["ground_classes"]
         steps, mask = list_ground_steps(raster["height"], raster["occupied"], (len(classes), grid.rows, grid.cols))
-        scaled = _scale_steps(spec, raster["height_step_m"], self.offset_m(spec), clip_heights)
+        surface = find_surface(self.source, self.scene_ids[row], spec.surface)
+        scaled = _scale_steps(spec, raster["height_step_m"], find_surface_offset(surface, spec), clip_heights)
         height = np.zeros(mask.shape, scaled.dtype)
         height[mask] = scaled[steps.view(np.uint16)]
         if classes != list(spec.ground_classes):
@@ -304,6 +303,7 @@ def _read_stored_layouts(shard: Shard) -> StoredLayouts:
         cholesky=read_fixed_lists(primitives["cholesky"], 6),
         rasters=rasters.combine_chunks(),
         source=shard.source,
+        scene_ids=scenes["scene_id"].to_pylist(),
     )
 
 
@@ -362,22 +362,20 @@ class LatentReader:
     """Read samples for stage 2: labels, and moments of the latents.
 
     Attributes:
-        latents_root: Directory of the latents.
+        latents_roots: Directory of the latents of each dataset directory.
         label: Kind of label.
         streets: Whether to read the latents of the streets, too.
-        added: Directories of the latents of further datasets, by dataset directory.
         thresholds: Thresholds of the vegetation and the vehicle density, from which labels are computed. None: each
             scene has its stored label.
     """
 
-    latents_root: str
+    latents_roots: Mapping[str, str]
     label: str
     streets: bool = False
-    added: Mapping[str, str] = field(default_factory=dict)
     thresholds: Thresholds = None
 
     def __call__(self, shard: Shard, rows: np.ndarray, places: np.ndarray | None = None) -> Arrays:
-        root = self.added.get(shard.root, self.latents_root)
+        root = self.latents_roots[shard.root]
         arrays = _read_latents(shard, root, self.label, self.thresholds)
         if self.streets:
             arrays = arrays | _read_street_latents(shard, root)

@@ -9,22 +9,22 @@ import numpy as np
 from pipelines.schema.tables import Shard
 from pipelines.training.data_loader import Stream
 
-BLOCK = 1000  # The shares of the datasets are exact in each block of this number of samples.
+CYCLE = 1000  # The shares of the datasets are exact in each cycle of this number of samples.
 
 
 @dataclass(frozen=True)
 class MixedStream:
     """The endless, seeded order of the samples of several datasets.
 
-    Each block of BLOCK samples has the datasets' shares, in random order. Within a dataset, the samples have the order
-    of its own stream; each of its epochs visits all its scenes.
+    Each cycle of CYCLE samples has the datasets' shares, in random order. Samples of a dataset keep the order of its
+    stream; each of its epochs visits all its scenes.
 
     Attributes:
         streams: Order of the samples of each dataset.
-        weights: Share of each dataset, up to a common factor.
+        weights: Relative sampling weights.
 
     Raises:
-        ValueError: A share is less than one sample per block.
+        ValueError: A dataset gets less than one sample per cycle.
     """
 
     streams: tuple[Stream, ...]
@@ -32,7 +32,10 @@ class MixedStream:
 
     def __post_init__(self) -> None:
         if min(self.quotas) < 1:
-            raise ValueError(f"the weights {self.weights} differ by more than a factor of {BLOCK}")
+            root = self.streams[int(np.argmin(self.quotas))].shards[0].root
+            raise ValueError(
+                f"{root} gets less than one of {CYCLE} samples; use more even --dataset-weights than {self.weights}"
+            )
 
     @property
     def batch_size(self) -> int:
@@ -51,10 +54,10 @@ class MixedStream:
 
     @property
     def quotas(self) -> tuple[int, ...]:
-        """Number of samples of each dataset in a block; they sum to BLOCK."""
-        exact = BLOCK * np.array(self.weights) / sum(self.weights)
+        """Number of samples of each dataset in a cycle; they sum to CYCLE."""
+        exact = CYCLE * np.array(self.weights) / sum(self.weights)
         quotas = np.floor(exact).astype(int)
-        largest = np.argsort(quotas - exact, kind="stable")[: BLOCK - quotas.sum()]
+        largest = np.argsort(quotas - exact, kind="stable")[: CYCLE - quotas.sum()]
         quotas[largest] += 1
         return tuple(quotas.tolist())
 
@@ -69,30 +72,30 @@ class MixedStream:
             Index into `shards` and row, each (count,).
         """
         wanted = np.arange(first, first + count)
-        source, place = np.empty(count, np.int64), np.empty(count, np.int64)
-        for block in np.unique(wanted // BLOCK):
-            here = wanted // BLOCK == block
-            sources, places = self._order_block(int(block))
-            source[here], place[here] = sources[wanted[here] % BLOCK], places[wanted[here] % BLOCK]
+        source, position = np.empty(count, np.int64), np.empty(count, np.int64)
+        for cycle in np.unique(wanted // CYCLE):
+            here = wanted // CYCLE == cycle
+            sources, positions = self._order_cycle(int(cycle))
+            source[here], position[here] = sources[wanted[here] % CYCLE], positions[wanted[here] % CYCLE]
         shard, row = np.empty(count, np.int64), np.empty(count, np.int64)
         start = 0
         for k, stream in enumerate(self.streams):
             mine = source == k
-            if mine.any():  # The places of a dataset are consecutive.
-                shards, rows = stream.positions(int(place[mine][0]), int(mine.sum()))
+            if mine.any():  # Positions of a dataset are consecutive.
+                shards, rows = stream.positions(int(position[mine][0]), int(mine.sum()))
                 shard[mine], row[mine] = start + shards, rows
             start += len(stream.shards)
         return shard, row
 
-    def _order_block(self, block: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the dataset of each sample of a block, and its place in the stream of the dataset, each (BLOCK,)."""
+    def _order_cycle(self, cycle: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the dataset of each sample of a cycle, and its position in the stream of the dataset (CYCLE,)."""
         quotas = np.array(self.quotas)
         source = np.repeat(np.arange(len(quotas)), quotas)
-        np.random.default_rng([self.streams[0].seed, block]).shuffle(source)
-        place = np.empty(BLOCK, np.int64)
+        np.random.default_rng([self.streams[0].seed, cycle]).shuffle(source)
+        position = np.empty(CYCLE, np.int64)
         for k, quota in enumerate(quotas):
-            place[source == k] = block * quota + np.arange(quota)
-        return source, place
+            position[source == k] = cycle * quota + np.arange(quota)
+        return source, position
 
 
 def mix_streams(streams: list[Stream], weights: tuple[float, ...]) -> Stream | MixedStream:
@@ -100,7 +103,7 @@ def mix_streams(streams: list[Stream], weights: tuple[float, ...]) -> Stream | M
 
     Args:
         streams: Order of the samples of each dataset.
-        weights: Share of the samples from each dataset, up to a common factor.
+        weights: Relative sampling weights.
 
     Returns:
         A mixture of the streams with a weight above 0, or the only one.

@@ -69,7 +69,7 @@ def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluste
     output, counts, refused = export(ExportConfig(str(tmp_path), formats=("glb", "ply", "npz", "xodr", "geojson")))
     assert counts == {"glb": 2, "ply": 2, "npz": 2, "xodr": 1, "geojson": 2}
     assert list(refused) == ["bare"] and refused["bare"].startswith("xodr: scene bare has no road")
-    with pytest.raises(ValueError, match=r"tracks.*no such file.*jobs/simulate_traffic.py, or name its directory"):
+    with pytest.raises(ValueError, match=r"tracks.*no such file.*jobs/simulate_traffic.py, or pass its directory"):
         export(ExportConfig(str(tmp_path), formats=("animation",)))
     traffic = make_tracks_table(town_scenes[0].scene_id, make_tracks())
     storage.write_parquet(traffic, Shard(str(tmp_path / "simulated"), "town", "test", 0).path("tracks"))

@@ -16,13 +16,13 @@ from pipelines.reporting.model_card import ModelCard, TrainingRecord
 from pipelines.runtime import storage
 from pipelines.schema.attribution import ATTRIBUTIONS
 from pipelines.schema.columns import SCENES
-from pipelines.schema.dataset import DENSITY_COLUMNS, label_scenes
+from pipelines.schema.dataset import DENSITY_COLUMNS, Dataset, label_scenes
 from pipelines.schema.density_labels import DensityThresholds
 from pipelines.schema.ground_surface import to_model_surface
 from pipelines.schema.mixture import Mixture
 from pipelines.schema.tables import Shard
 from pipelines.training.data_loader import LayoutReader, Stream, read_label_indices, read_samples
-from pipelines.training.mixed_stream import BLOCK, MixedStream, mix_streams
+from pipelines.training.mixed_stream import CYCLE, MixedStream, mix_streams
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +38,14 @@ def map_shards(tmp_path_factory) -> tuple[Shard, ...]:
 # --------------------------------------------------------------------------------------------------- samples
 
 
-def test_each_block_has_the_shares_of_the_datasets(layout_shards, map_shards):
+def test_each_cycle_has_the_shares_of_the_datasets(layout_shards, map_shards):
     streams = Stream(layout_shards, SHARD_SIZES, 4, seed=0), Stream(map_shards, (3, 3), 4, seed=0)
     mixed = mix_streams(list(streams), (2.0, 1.0))
     assert isinstance(mixed, MixedStream) and mixed.quotas == (667, 333)
-    shard, row = mixed.positions(0, 3 * BLOCK)
+    shard, row = mixed.positions(0, 3 * CYCLE)
     assert mixed.shards == layout_shards + map_shards and mixed.counts == (*SHARD_SIZES, 3, 3)
-    for block in range(3):
-        assert (shard[block * BLOCK : (block + 1) * BLOCK] < len(SHARD_SIZES)).sum() == 667
+    for cycle in range(3):
+        assert (shard[cycle * CYCLE : (cycle + 1) * CYCLE] < len(SHARD_SIZES)).sum() == 667
     for k, stream in enumerate(streams):  # Each dataset is read in the order of its own stream.
         mine = (shard < len(SHARD_SIZES)) == (k == 0)
         shards, rows = stream.positions(0, int(mine.sum()))
@@ -68,13 +68,13 @@ def test_dataset_of_weight_zero_is_not_sampled(layout_shards, map_shards):
     streams = [Stream(layout_shards, SHARD_SIZES, 4, seed=0), Stream(map_shards, (3, 3), 4, seed=0)]
     assert mix_streams(streams, (1.0, 0.0)) is streams[0]
     assert mix_streams(streams, (0.0, 0.5)) is streams[1]
-    with pytest.raises(ValueError, match="differ by more than a factor of 1000"):
+    with pytest.raises(ValueError, match="gets less than one of 1000 samples; use more even --dataset-weights"):
         mix_streams(streams, (1.0, 1e-6))
 
 
 @pytest.mark.parametrize("augment", [None, Augmentation(flip=True, move_m=1.0, turn_rad=0.05, seed=1)])
 def test_samples_have_the_reference_surface_of_the_model(layout_shards, map_shards, augment):
-    """In scenes of maps, objects stand on the ground heights; in the town, 0.3 m below. A model knows one of both."""
+    """In scenes of maps, objects stand on the ground heights; in the town, 0.3 m below. A model has one surface."""
     spec = small_spec(32)
     assert spec.surface == "top"
     mixed = MixedStream(
@@ -133,13 +133,22 @@ def test_layout_of_a_model_names_what_it_lacks():
     wide = replace(model, grid=replace(model.grid, resolution_m=2.0))
     with pytest.raises(ValueError, match=r"/maps covers x from -64 to 64 m and y from .* expected 0 to 64 m"):
         model.require_cover(wide, "/maps")
-    with pytest.raises(ValueError, match="data set 2 covers"):
+    with pytest.raises(ValueError, match="dataset 2 covers"):
         LayoutSpec.merge([model, wide])
+    large = replace(model, cholesky_bounds=Bounds(model.cholesky_bounds.low, (17.0, *model.cholesky_bounds.high[1:])))
+    assert model.require_cover(large, "/maps") == [
+        "/maps has larger or smaller objects than the bounds of the layout: sizes are clipped"
+    ]
+    assert (
+        model.require_cover(replace(model, surface="surface", height_bounds_m=Bounds((-2.3,), (0.7,))), "/maps") == []
+    )
+    (low,) = model.require_cover(replace(model, surface="surface"), "/maps")
+    assert low == "/maps has ground heights from -1.7 to 1.3 m, but the bounds of the layout are -2 to 1 m"
     hills = replace(model, slots=(9, *model.slots[1:]), height_bounds_m=Bounds((-7,), (0.5,)))
     assert model.covers_heights(model) and not model.covers_heights(hills)
     few, high = model.require_cover(hills, "/hills")
     assert few == "/hills has slots for more objects of vegetation_cuboid: the farthest ones are left out"
-    assert high == "/hills has z of ground heights from -7 to 0.5 m, but the bounds of the layout are -2 to 1 m"
+    assert high == "/hills has ground heights from -7 to 0.5 m, but the bounds of the layout are -2 to 1 m"
 
 
 # ---------------------------------------------------------------------------------------------------- labels
@@ -181,13 +190,27 @@ def test_mixture_names_wrong_options(tmp_path):
     with pytest.raises(ValueError, match=r"holds no dataset\.json"):
         Mixture.open([town, "/nowhere"])
     assert Mixture.open([town]).identity() == {}
-    mixture = Mixture.open([town])
-    both = Mixture((mixture.datasets[0], replace(mixture.datasets[0], root="/other")), (2.0, 1.0))
-    assert both.identity() == {
-        "added_datasets": ["/other"],
-        "added_sources": "town",
-        "dataset_weights": [2.0, 1.0],
+    assert Mixture.open([f"{town}/"]).datasets[0].root == town
+
+
+def test_identity_names_what_is_sampled(map_shards, tmp_path):
+    """Weights for a layout only, as of a reference model, are no training data."""
+    spec, thresholds = small_spec(), DensityThresholds(1, 1, 1, 1)
+    scene = replace(random_scene(1, source="osm"), attribution="someone")
+    Shard(str(tmp_path), "osm", "train", 0).write([scene])
+    town, maps, other = (
+        Dataset(root, source, {}, spec, thresholds, thresholds)
+        for root, source in (("/town", "town"), (map_shards[0].root, "osm"), (str(tmp_path), "osm"))
+    )
+    found = Mixture((town, maps, other), (2.0, 0.0, 1.0)).identity()
+    assert found == {
+        "added_datasets": [maps.root, other.root],
+        "added_sources": "osm",
+        "added_notices": "someone",
+        "dataset_weights": [2.0, 0.0, 1.0],
     }
+    assert Mixture((town, maps), (1.0, 0.0)).identity()["added_sources"] == ""
+    assert Mixture((town, maps), (1.0, 1.0)).identity()["added_notices"] == ""
 
 
 @pytest.mark.parametrize("augment", [None, Augmentation(flip=True, move_m=1.0, turn_rad=0.05, seed=1)])
@@ -205,20 +228,21 @@ def test_heights_outside_the_bounds_are_clipped_on_request(layout_shards, augmen
 
 def test_model_card_names_the_licences_of_all_data():
     run = TrainingRecord("lvae", "lvae", "", None, 1, 0.0, {"dataset": "/a", "added_datasets": "['/b']"}, {}, {}, {})
-    added = {"added_sources": "osm, kitti360", "dataset_weights": "[2.0, 1.0, 1.0]"}
+    notices = f"{ATTRIBUTIONS['kitti360']}; {ATTRIBUTIONS['osm']}"
+    added = {"added_sources": "osm, kitti360", "added_notices": notices, "dataset_weights": "[2.0, 1.0, 1.0]"}
     mixed = replace(run, options={**run.options, **added})
     cards = [
         ModelCard("x", "1", "none", ["any"], [one, run], {}, {"seed": 0, "sampler": "ddim"}, "test", {}, {})
         for one in (run, mixed)
     ]
-    assert [card._list_notices() for card in cards] == [[], [ATTRIBUTIONS["osm"], ATTRIBUTIONS["kitti360"]]]
+    assert [card._list_notices() for card in cards] == [[], [ATTRIBUTIONS["kitti360"], ATTRIBUTIONS["osm"]]]
     assert cards[0]._describe_data() == "The model is trained only on the dataset above."
     assert "mixed with scenes of the sources osm, kitti360" in cards[1]._describe_data()
     assert next(cards[0]._head()).startswith("---\nlicense: apache-2.0")
     assert next(cards[1]._head()).startswith("---\nlicense: other")
     shown = dict(mixed.rows({}))["options"]
     assert shown == "added_sources osm, kitti360, dataset_weights [2.0, 1.0, 1.0]"
-    assert not {"dataset", "added_datasets"} & set(mixed.record({})["options"])
+    assert not {"dataset", "added_datasets", "added_notices"} & set(mixed.record({})["options"])
 
 
 def test_scenes_of_maps_keep_their_ground_in_a_map_model(map_shards):

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from importlib.metadata import distribution
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,18 @@ import pytest
 import trimesh
 from helpers import ROOT
 from lxml import etree
+from scipy.spatial import cKDTree
 
 from models.scene import CATEGORIES, Grid, Scene
-from pipelines.geometry.parked_vehicles import find_driving_vehicles
+from pipelines.geometry.parked_vehicles import find_driving_vehicles, find_parked_vehicles
 from pipelines.io.animation import export_animation
 from pipelines.io.mesh_export import GLTF_FROM_SCENE
 from pipelines.io.mesh_import import import_glb
+from pipelines.io.opendrive import export_opendrive
 from pipelines.io.openscenario import export_openscenario
 from pipelines.preprocess.sources.town.version2.town import make_large_crops
 from pipelines.schema.columns import TRACKS
-from pipelines.schema.tracks import list_road_users, select_tracks
+from pipelines.schema.tracks import find_time_step, list_road_users, select_tracks
 from pipelines.traffic.dataset import make_tracks_table
 from pipelines.traffic.simulation import put_on_ground, read_tracks
 
@@ -91,10 +94,10 @@ def xosc_element(root: etree._Element) -> Any:
 def test_scenario_has_all_objects_and_road_users_once(scenario, town, tracks):
     names = [entity.get("name") for entity in scenario.iter("ScenarioObject")]
     still = {f"{CATEGORIES[town.category[k]]}_{k:05d}" for k in np.flatnonzero(~find_driving_vehicles(town))}
-    moving = {f"road_user_{user.object_id:05d}" for user in list_road_users(tracks)}
+    moving = {user.name for user in list_road_users(tracks)}
     assert len(names) == len(set(names)) and set(names) == still | moving
     assert {private.get("entityRef") for private in scenario.find("Storyboard/Init").iter("Private")} == still
-    assert [actor.get("entityRef") for actor in scenario.iter("EntityRef")] == sorted(moving)
+    assert [actor.get("entityRef") for actor in scenario.iter("EntityRef")] == [u.name for u in list_road_users(tracks)]
     kinds = {child.tag for entity in scenario.iter("ScenarioObject") for child in entity}
     assert kinds == {"Vehicle", "MiscObject", "Pedestrian"}
 
@@ -106,23 +109,56 @@ def test_boxes_in_the_scenario_are_the_boxes_of_the_scene(scenario, town):
         for private in scenario.iter("Private")
     }
     boxes = {e.get("name"): e.find(".//BoundingBox") for e in scenario.iter("ScenarioObject")}
-    for k in np.flatnonzero(~find_driving_vehicles(town))[::5]:
+    for k in np.flatnonzero(~find_driving_vehicles(town)):
         name = f"{CATEGORIES[town.category[k]]}_{k:05d}"
-        place, box = places[name], boxes[name]
-        x, y, z = (float(box.find("Center").get(axis)) for axis in "xyz")
-        cos, sin = np.cos(place["h"]), np.sin(place["h"])
-        found = [place["x"] + cos * x - sin * y, place["y"] + sin * x + cos * y, place["z"] + z]
-        assert np.allclose(found, town.center_m[k] + [0, 0, 0.3], atol=0.03)
-        size = [float(box.find("Dimensions").get(axis)) for axis in ("length", "width", "height")]
-        assert np.allclose(size, town.size_m[k], atol=1e-3)
+        found = place_corners(places[name], boxes[name])
+        local = np.array(list(product((-0.5, 0.5), repeat=3))) * town.size_m[k]
+        expected = local @ town.rotation[k].T + town.center_m[k] + [0, 0, 0.3]
+        assert cKDTree(found).query(expected)[0].max() < 0.03  # Turned by 180 degrees, a box is the same.
+
+
+def place_corners(place: dict, box: etree._Element) -> np.ndarray:
+    """Return the corners (8, 3) of a box by the rules of OpenSCENARIO: yaw about z, pitch about y, roll about x."""
+    center = np.array([float(box.find("Center").get(axis)) for axis in "xyz"])
+    size = np.array([float(box.find("Dimensions").get(axis)) for axis in ("length", "width", "height")])
+    local = center + np.array(list(product((-0.5, 0.5), repeat=3))) * size
+    (ch, cp, cr), (sh, sp, sr) = ([f(place[a]) for a in "hpr"] for f in (np.cos, np.sin))
+    yaw = np.array([[ch, -sh, 0], [sh, ch, 0], [0, 0, 1]])
+    pitch = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    roll = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    return local @ (yaw @ pitch @ roll).T + [place[axis] for axis in "xyz"]
+
+
+def test_fronts_of_entities_are_those_of_the_scene(town, tracks):
+    """A heading along or against the length gives the front; a heading across it, as of signs, does not turn it."""
+    parked = np.flatnonzero(find_parked_vehicles(town))[:3]
+    for turn_rad in (0.0, np.pi, np.pi / 2):
+        heading_rad = town.heading_rad.copy()
+        heading_rad[parked] = town.yaw_rad[parked] + turn_rad
+        root = etree.fromstring(export_openscenario(replace(town, heading_rad=heading_rad), tracks, "a.xodr"))
+        found = {private.get("entityRef"): next(private.iter("WorldPosition")) for private in root.iter("Private")}
+        for k in parked:
+            h = float(found[f"{CATEGORIES[town.category[k]]}_{k:05d}"].get("h"))
+            ahead = town.yaw_rad[k] + (np.pi if turn_rad == np.pi else 0.0)
+            assert np.cos(h - ahead) == pytest.approx(1, abs=1e-5)
 
 
 def test_vehicles_follow_the_table_on_the_ground(scenario, town, tracks):
     height_m = town.surface()[0]
     for user in list_road_users(tracks):
-        group = next(g for g in scenario.iter("ManeuverGroup") if g.get("name").endswith(f"{user.object_id:05d}"))
+        group = next(g for g in scenario.iter("ManeuverGroup") if g.get("name").endswith(f" {user.name}"))
         starts = [float(c.get("value")) for c in group.iter("SimulationTimeCondition")]
-        assert starts[0] == starts[1] == user.time_s[0] and starts[-1] > user.time_s[-1]
+        assert starts == [user.time_s[0], user.time_s[0], user.time_s[-1] + find_time_step([user])]
+        timing = next(group.iter("Timing"))
+        assert (timing.get("domainAbsoluteRelative"), timing.get("scale"), timing.get("offset")) == (
+            "absolute",
+            "1.0",
+            "0.0",
+        )
+        entity = next(e for e in scenario.iter("ScenarioObject") if e.get("name") == user.name)
+        size = [float(next(entity.iter("Dimensions")).get(name)) for name in ("length", "width", "height")]
+        assert np.allclose(size, user.size_m, atol=1e-3)
+        first = next(group.iter("AddEntityAction"))[0][0]
         vertices = list(group.iter("Vertex"))
         assert np.allclose([float(v.get("time")) for v in vertices], user.time_s, atol=1e-4)
         x, y, z, yaw = np.array([[float(v[0][0].get(a)) for a in "xyzh"] for v in vertices]).T
@@ -133,7 +169,8 @@ def test_vehicles_follow_the_table_on_the_ground(scenario, town, tracks):
         inside = (row >= 0) & (col >= 0) & (row < town.grid.rows) & (col < town.grid.cols)
         ground_m = height_m[row.clip(0, 255), col.clip(0, 255)]
         assert np.median(np.abs(z - ground_m)[inside]) < 0.05  # Wheels stand on the road of the OpenDRIVE file.
-        assert np.abs(np.diff(yaw)).max(initial=0) < np.pi
+        assert np.abs(np.diff(yaw)).max(initial=0) < np.pi and np.allclose(np.cos(yaw - user.yaw_rad), 1, atol=1e-5)
+        assert [float(first.get(a)) for a in "xyzh"] == [x[0], y[0], z[0], yaw[0]]
 
 
 def test_scene_without_traffic_is_refused(town):
@@ -143,6 +180,14 @@ def test_scene_without_traffic_is_refused(town):
     ):
         with pytest.raises(ValueError, match="has no traffic to export"):
             export()
+
+
+def test_texts_that_xml_forbids_are_replaced(town, tracks):
+    odd = replace(town, scene_id="$a\x07b", attribution="c\x00d")
+    root = etree.fromstring(export_openscenario(odd, tracks, "a.xodr"))
+    assert root.find("FileHeader").get("description") == "Scene $a\ufffdb"
+    assert root.find("FileHeader/License").get("name") == "c\ufffdd"
+    assert etree.fromstring(export_opendrive(odd)).find("header").get("name") == "$a\ufffdb"
 
 
 def test_missing_package_is_named(town, tracks, monkeypatch):
@@ -191,7 +236,7 @@ def test_animated_nodes_follow_the_table(animation, tracks):
     channels = {(c["target"]["node"], c["target"]["path"]): moves["samplers"][c["sampler"]] for c in moves["channels"]}
     nodes = {node["name"]: number for number, node in enumerate(tree["nodes"])}
     for user in list_road_users(tracks):
-        number = nodes[f"road_user_{user.object_id:04d}"]
+        number = nodes[user.name]
         curves = {
             path: [read_accessor(tree, numbers, channels[number, path][end]) for end in ("input", "output")]
             for path in ("translation", "rotation", "scale")
@@ -215,7 +260,8 @@ def test_animation_without_player_is_the_scene_without_traffic(animation, town):
     loaded = trimesh.load_scene(io.BytesIO(animation), file_type="glb")
     still = town.select(~find_driving_vehicles(town))
     shown = [name for name in loaded.graph.nodes_geometry if not name.startswith("road_user_")]
-    assert len(shown) == len(still) + 1
+    original = np.flatnonzero(~find_driving_vehicles(town))  # Nodes have the numbers of the whole scene.
+    assert set(shown) == {f"{CATEGORIES[town.category[k]]}_{k:04d}" for k in original} | {"ground"}
     for name in loaded.graph.nodes_geometry:
         if name.startswith("road_user_"):
             assert np.allclose(loaded.graph[name][0][:3, :3], 0)
