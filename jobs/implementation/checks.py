@@ -47,6 +47,12 @@ def open_mixture(config: LVAEConfig | DiTConfig, source: str) -> Mixture:
     return Mixture.open([find_training_dataset(config, source), *added], config.dataset_weights)
 
 
+def require_datasets(roots: Sequence[str]) -> None:
+    """Raise an error if a directory is no dataset. The smoke preset checks this before it generates its own dataset."""
+    for root in roots:
+        Dataset.open(make_absolute(root))
+
+
 def needs_smoke_inputs(config: LVAEConfig | DiTConfig) -> bool:
     """Return whether a training run generates its own missing inputs."""
     return config.preset == "smoke" and not config.dataset
@@ -63,7 +69,9 @@ def check_train_lvae(config: LVAEConfig) -> None:
         )
     if config.start_from:
         find_start(config.start_from)
-    if not needs_smoke_inputs(config):
+    if needs_smoke_inputs(config):
+        require_datasets(config.add_datasets)
+    else:
         open_mixture(config, row.source)
 
 
@@ -85,7 +93,9 @@ def find_start(model: str) -> tuple[str, bool]:
 def check_train_dit(config: DiTConfig) -> None:
     row = find_preset(DIT_PRESETS, config.preset)
     require_positive(config, "gradient_accumulation_steps")
-    if not needs_smoke_inputs(config):
+    if needs_smoke_inputs(config):
+        require_datasets(config.add_datasets)
+    else:
         mixture = open_mixture(config, LVAE_PRESETS[row.lvae].source)
         resolve_label_kind(config, mixture)
         find_latents(config, mixture)
@@ -141,7 +151,13 @@ def find_latents(config: DiTConfig, mixture: Mixture) -> list[str]:
     digests = []
     for latents, root in zip(found, roots, strict=True):
         require_latents(latents, root)
-        digests.append(storage.read_json(storage.join_uri(latents, "latents.json"))["lvae_digest"])
+        content = storage.read_json(storage.join_uri(latents, "latents.json"))
+        if (other := content["dataset"]) != root and other in roots:
+            raise ValueError(
+                f"{latents} holds latents of {other}, expected those of {root}; give --latents and --add-latents in the"
+                " order of --dataset and --add-datasets"
+            )
+        digests.append(content["lvae_digest"])
         if digests[-1] != digests[0]:
             raise ValueError(
                 f"{latents} holds latents of another layout VAE than {found[0]}; encode {root} with that layout VAE,"
@@ -159,11 +175,13 @@ def require_latents(latents_root: str, dataset_root: str) -> None:
     path = storage.join_uri(latents_root, "latents.json")
     if not storage.exists(path):
         raise ValueError(
-            f"{latents_root}: no latents.json here; run jobs/encode_latents.py --dataset {dataset_root} first"
+            f"{latents_root}: no latents.json here; run jobs/encode_latents.py --dataset {dataset_root} --output"
+            f" {latents_root} first, with --lvae MODEL"
         )
     if not storage.read_json(path)["complete"]:
         raise ValueError(
-            f"{latents_root}: latents are incomplete; run jobs/encode_latents.py --dataset {dataset_root} again"
+            f"{latents_root}: latents are incomplete; run jobs/encode_latents.py --dataset {dataset_root} --output"
+            f" {latents_root} again, with the same --lvae"
         )
 
 

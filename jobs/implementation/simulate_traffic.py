@@ -39,7 +39,7 @@ def write_videos(
 ) -> tuple[list[Picture], list[str]]:
     """Write moving pictures of the first scenes with traffic; return a picture of each, and the names of the files."""
     pictures, names = [], []
-    for shard, rows in selection.shards():
+    for shard, rows in selection.shards() if count else []:
         found = read_tracks(replace(shard, root=output))
         for scene in shard.scenes(rows[: count - len(pictures)]):
             tracks = select_tracks(found, scene.scene_id)
@@ -80,4 +80,4 @@ def main(config: Config) -> None:
         print(f"{name} ({count_simulated(table)} of {len(table)}): {text or 'no scene could be simulated'}")
     for reason, count in list(count_failures(sets[SCENES]).items())[:5]:
         print(f"  {count} without simulation: {reason}")
-    print(f"tables tracks and traffic, traffic.html and traffic_videos in {output}")
+    print(f"tables tracks and traffic, traffic.html{' and traffic_videos' if videos else ''} in {output}")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 import numpy as np
 
 from models.layout import LayoutSpec
+from models.uris import is_uri
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import find_shards
 
@@ -39,7 +41,8 @@ class Mixture:
             ValueError: A dataset is incomplete or is given twice, or the weights are invalid.
         """
         roots = [root.rstrip("/") for root in roots]
-        if twice := [root for root in set(roots) if roots.count(root) > 1]:
+        places = [root if is_uri(root) else os.path.realpath(root) for root in roots]
+        if twice := [root for root, place in zip(roots, places, strict=True) if places.count(place) > 1]:
             raise ValueError(f"{twice[0]} is given twice; use --dataset-weights to sample it more often")
         weights = weights or (1.0,) * len(roots)
         if len(weights) != len(roots):

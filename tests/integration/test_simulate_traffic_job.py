@@ -43,6 +43,7 @@ def test_job_writes_tables_page_and_videos_and_resumes(cluster, tmp_path):
     page = (tmp_path / "traffic.html").read_text()
     assert "Health of the road network" in page and "has no road" in page
     assert len(list((tmp_path / "traffic_videos").iterdir())) == 1
+    main(replace(config, num_examples=0))  # Without moving pictures, the job still writes its page.
     assert json.loads((tmp_path / "traffic-town-test.json").read_text())["seed"] == 0
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.parquet")}
     main(config)

@@ -429,6 +429,8 @@ def test_models_train_on_two_datasets(home, tmp_path, capsys, monkeypatch):
     options = mixed | {"latents": latents[0], "add_latents": (latents[1],), "label_kind": "joint"}
     with pytest.raises(ValueError, match=r"map.*no latents\.json here"):
         check_train_dit(DiTConfig(**{**options, "add_latents": ()}))
+    with pytest.raises(ValueError, match=r"map-latents holds latents of .*maps, expected those of .*smoke; give"):
+        check_train_dit(DiTConfig(**{**options, "latents": latents[1], "add_latents": (latents[0],)}))
     with pytest.raises(ValueError, match=r"latents of another layout VAE.*--add-latents"):
         check_train_dit(DiTConfig(**{**options, "latents": ""}))
     run, _ = prepare_dit(DiTConfig(**options, name="dit-prepared"))

@@ -184,6 +184,10 @@ def test_mixture_names_wrong_options(tmp_path):
         Mixture.open([town, town])
     with pytest.raises(ValueError, match=r"--dataset-weights has 2 numbers, expected 1: one for --dataset and one for"):
         Mixture.open([town], (1.0, 2.0))
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path)
+    with pytest.raises(ValueError, match="is given twice"):
+        Mixture.open([town, str(link)])
     for weights in ((0.0,), (-1.0,), (float("nan"),), (float("inf"),)):
         with pytest.raises(ValueError, match="expected numbers of 0 or more, not all 0"):
             Mixture.open([town], weights)
