@@ -117,9 +117,8 @@ def resolve_label_kind(config: DiTConfig, mixture: Mixture) -> str:
     Raises:
         ValueError: A dataset has no object of a category that the label counts. All its scenes would get one label.
     """
-    used = [one for one, weight in zip(mixture.datasets, mixture.weights, strict=True) if weight > 0]
     without = {
-        name: [one.root for one in used if not {CATEGORIES[k] for k in group} & set(one.spec.categories)]
+        name: [one.root for one in mixture.sampled if not {CATEGORIES[k] for k in group} & set(one.spec.categories)]
         for name, group in DENSITY_GROUPS.items()
     }
     lacks = {name for name, roots in without.items() if roots}

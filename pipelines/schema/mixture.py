@@ -55,6 +55,11 @@ class Mixture:
         return cls(tuple(Dataset.open(root) for root in roots), tuple(weights))
 
     @property
+    def sampled(self) -> list[Dataset]:
+        """Datasets with a weight above 0."""
+        return [one for one, weight in zip(self.datasets, self.weights, strict=True) if weight > 0]
+
+    @property
     def layout(self) -> LayoutSpec:
         """Layout that covers all datasets."""
         return LayoutSpec.merge([dataset.spec for dataset in self.datasets])
@@ -74,7 +79,7 @@ class Mixture:
         """Return the options that must not change when a run is resumed; empty for a single dataset."""
         if len(self.datasets) == 1:
             return {}
-        used = [dataset for dataset, weight in zip(self.datasets[1:], self.weights[1:], strict=True) if weight > 0]
+        used = [dataset for dataset in self.sampled if dataset.root != self.datasets[0].root]
         shards = [shard for one in used for shard in find_shards(one.root, source=one.source, split="train")]
         notices = {
             notice for shard in shards for notice in shard.read("scenes", ["attribution"])["attribution"].to_pylist()

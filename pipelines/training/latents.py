@@ -62,11 +62,13 @@ class Encoder:
     @torch.no_grad()
     def encode(self, shard: Shard) -> tuple[list[str], np.ndarray, np.ndarray]:
         """Return the scene ids of a shard, and latent means and log-variances, each float16 (n, c, h, w)."""
-        scenes, spec = shard.scenes(), self.model.spec
+        spec = self.model.spec
+        scenes = [to_model_surface(scene, spec) for scene in shard.scenes()]
         parts = []
         for start in range(0, len(scenes), self.batch_size):
-            chosen = [to_model_surface(scene, spec) for scene in scenes[start : start + self.batch_size]]
-            posterior = self.model.encode(make_layout_batch(chosen, spec).to(self.device))
+            posterior = self.model.encode(
+                make_layout_batch(scenes[start : start + self.batch_size], spec).to(self.device)
+            )
             parts.append([v.half().cpu().numpy() for v in (posterior.mean, posterior.logvar)])
         mean, logvar = (np.concatenate(group) for group in zip(*parts, strict=True))
         return [scene.scene_id for scene in scenes], mean, logvar
@@ -74,11 +76,12 @@ class Encoder:
     @torch.no_grad()
     def encode_streets(self, shard: Shard) -> pa.Table:
         """Return the rows of the table street_latents of a shard."""
-        scenes, spec = shard.scenes(), self.model.spec
+        spec = self.model.spec
+        scenes = [to_model_surface(scene, spec) for scene in shard.scenes()]
         channels, size, _ = self.model.latent_shape
         grounds, cells = [], []
         for start in range(0, len(scenes), self.batch_size):
-            kept = [keep_streets(to_model_surface(s, spec)) for s in scenes[start : start + self.batch_size]]
+            kept = [keep_streets(scene) for scene in scenes[start : start + self.batch_size]]
             batch = make_layout_batch([scene for scene, _ in kept], spec).to(self.device)
             grounds.append(self.model.encode(batch).mean[:, : channels // 2].half().cpu().numpy())
             cells += [~find_region_cells(~paved, size) for _, paved in kept]
