@@ -85,12 +85,10 @@ def prepare(config: Config) -> TrainingRun:
     kept = start = None
     spec = mixture.layout.with_resolution(row.raster_px)
     if config.start_from:
-        start = load_start(config.start_from, row.architecture(), spec, mixes=bool(config.add_datasets))
+        start = load_start(config.start_from, row.architecture(), spec)
         spec = start.spec
     if config.train_object_decoder_of:
-        kept = load_kept_weights(
-            config.train_object_decoder_of, row.architecture(), None if config.add_datasets else spec
-        )
+        kept = load_kept_weights(config.train_object_decoder_of, row.architecture())
         spec = kept.spec
         require_replaceable(name, kept)
     for note in mixture.require_cover(spec):
@@ -212,11 +210,11 @@ class Kept:
     spec: LayoutSpec
 
 
-def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec | None) -> Kept:
-    """Return the layout VAE of a trained pipeline; `spec` is the layout that it needs to have.
+def load_kept_weights(model: str, architecture: dict) -> Kept:
+    """Return the layout VAE of a trained pipeline.
 
     Raises:
-        ValueError: The encoders or the layout of the pipeline differ from those of this run.
+        ValueError: The encoders of the pipeline differ from those of this run.
     """
     pipeline = load_pipeline(find_pipeline_directory(model))
     lvae = pipeline.lvae
@@ -226,28 +224,22 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec | None) -
                 f"--train-object-decoder-of {model}: its {key} is {built}, but that of this preset is {wanted}; "
                 "use the preset of this pipeline"
             )
-    if spec and lvae.spec.fingerprint() != spec.fingerprint():
-        raise ValueError(
-            f"--train-object-decoder-of {model}: its layout differs from that of this dataset; "
-            "use the dataset of this pipeline"
-        )
     return Kept(digest_weights(lvae), digest_weights(pipeline.dit), lvae.state_dict(), lvae.spec)
 
 
-def load_start(model: str, architecture: dict, spec: LayoutSpec, mixes: bool = False) -> LayoutVAE:
+def load_start(model: str, architecture: dict, spec: LayoutSpec) -> LayoutVAE:
     """Return the trained layout VAE from which a run starts.
 
-    The networks of the decoder "cells" do not depend on the number of slots, which may therefore differ.
+    The run has the layout of these weights. The networks of the decoder "cells" do not depend on the number of slots,
+    so each category gets at least the slots of the datasets.
 
     Args:
         model: Directory of a layout VAE, or any value that --model accepts.
         architecture: Options of the preset.
-        spec: Layout of the dataset, or of a mixture.
-        mixes: Whether several datasets are mixed. The run then has the layout of the weights, with the slots of the
-            mixture if the decoder is "cells".
+        spec: Layout of the datasets.
 
     Raises:
-        ValueError: The networks or the layout differ from those of this run.
+        ValueError: The networks or the grid differ from those of this run.
     """
     directory, is_lvae = find_start(model)
     lvae = load_lvae(directory) if is_lvae else load_pipeline(directory).lvae
@@ -257,28 +249,23 @@ def load_start(model: str, architecture: dict, spec: LayoutSpec, mixes: bool = F
                 f"--start-from {model}: its {key} is {built}, but that of this preset is {wanted}; use the preset with"
                 " which it was trained"
             )
-    if mixes:
-        if lvae.spec.grid != spec.grid:
-            raise ValueError(
-                f"--start-from {model}: its grid is {lvae.spec.grid}, but that of this preset is {spec.grid}; use the "
-                "preset with which it was trained"
-            )
-        own, slots = lvae.spec, dict(zip(spec.categories, spec.slots, strict=True))
-        if lvae.config.objects["decoder"] == "cells":
-            wanted = [max(count, slots.get(name, 0)) for name, count in zip(own.categories, own.slots, strict=True)]
-            own = replace(own, slots=tuple(wanted))
-        spec = own
-    may_resize = lvae.config.objects["decoder"] == "cells" and len(lvae.spec.slots) == len(spec.slots)
-    own = replace(lvae.spec, slots=spec.slots) if may_resize else lvae.spec
-    own.require(spec, f"the dataset of this run, which continues {model},")
+    own, slots = lvae.spec, dict(zip(spec.categories, spec.slots, strict=True))
+    if own.grid != spec.grid:
+        raise ValueError(
+            f"--start-from {model}: its grid is {own.grid}, but that of this preset is {spec.grid}; use the preset with"
+            " which it was trained"
+        )
+    if lvae.config.objects["decoder"] == "cells":
+        wanted = [max(count, slots.get(name, 0)) for name, count in zip(own.categories, own.slots, strict=True)]
+        own = replace(own, slots=tuple(wanted))
     if own == lvae.spec:
         return lvae
-    resized = LayoutVAE.from_config({**lvae.config, "layout": spec.to_dict()})
+    resized = LayoutVAE.from_config({**lvae.config, "layout": own.to_dict()})
     try:
         resized.load_state_dict(lvae.state_dict())
     except RuntimeError as error:
         raise ValueError(
-            f"--start-from {model}: with the slots of this dataset {spec.slots}, the decoder has another size than with"
+            f"--start-from {model}: with the slots of this dataset {own.slots}, the decoder has another size than with"
             f" {lvae.spec.slots}; preprocess the dataset with the same --slots"
         ) from error
     return resized.requires_grad_(False)
