@@ -33,6 +33,7 @@ LIMITS = {
     "raster_pixels": Limit(2**26, "pixels of all ground classes of a scene"),
     "scene_primitives": Limit(200_000, "primitives of a scene"),
     "scene_coverage": Limit(2**29, "pixels visited to rasterise the ground polygons or triangles of a scene"),
+    "scene_voxels": Limit(2**28, "voxels of a scene"),
     "table_rows": Limit(2_000_000, "rows, objects or list entries of a file"),
     "table_bytes": Limit(2**29, "estimated bytes in memory of the columns that are read from a table file"),
     "text_characters": Limit(1_000, "characters of an id, a label or a name"),

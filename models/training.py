@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -46,19 +46,22 @@ from models.vae.matching import NonFiniteCostError
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Options of AdamW. The learning rate is constant or follows a cosine, after an optional linear warm-up.
+    """Options of AdamW. The learning rate is constant or decays, after an optional linear warm-up.
 
     Attributes:
         steps: Number of training steps.
         learning_rate: Learning rate at the start of the decay. During a warm-up, it rises to this value.
         weight_decay: Weight decay.
-        final_learning_rate: Learning rate of the last step; None: the learning rate is constant.
+        final_learning_rate: Learning rate of the last step; None: the learning rate does not decay towards one.
+        decay: Shape of the decay towards the final learning rate, "cosine" or "linear".
+        milestones: Steps from which the learning rate is multiplied by a factor, as pairs (step, factor).
         warmup_steps: Number of initial steps during which the learning rate rises linearly.
         betas: beta1 and beta2 of AdamW.
         cycle_momentum: beta1 at the first step and at the last step. In between, beta1 follows a cosine. None: beta1 is
             constant.
         grad_clip: Largest gradient norm; None: gradients are not clipped.
         ema_decay: Decay of the exponential moving average of the weights; None: no moving average.
+        amsgrad: Whether AdamW uses the maximum of past squared gradients (AMSGrad).
         seed: Seed of all random numbers.
     """
 
@@ -66,11 +69,14 @@ class OptimizerConfig:
     learning_rate: float
     weight_decay: float
     final_learning_rate: float | None = None
+    decay: Literal["cosine", "linear"] = "cosine"
+    milestones: tuple[tuple[int, float], ...] = ()
     warmup_steps: int = 0
     betas: tuple[float, float] = (0.9, 0.999)
     cycle_momentum: tuple[float, float] | None = None
     grad_clip: float | None = None
     ema_decay: float | None = None
+    amsgrad: bool = False
     seed: int = 0
 
     def at(self, step: int) -> tuple[float, float]:
@@ -84,10 +90,14 @@ class OptimizerConfig:
         """
         rate, beta1 = self.learning_rate, self.betas[0]
         if self.final_learning_rate is not None:
-            fall = (1 - math.cos(math.pi * min(step / max(self.steps - 1, 1), 1))) / 2
+            fall = min(step / max(self.steps - 1, 1), 1)
+            if self.decay == "cosine":
+                fall = (1 - math.cos(math.pi * fall)) / 2
             rate += fall * (self.final_learning_rate - rate)
             if self.cycle_momentum:
                 beta1 = self.cycle_momentum[0] + fall * (self.cycle_momentum[1] - self.cycle_momentum[0])
+        for start, factor in self.milestones:
+            rate *= factor if step >= start else 1
         if step < self.warmup_steps:
             rate *= (step + 1) / self.warmup_steps
         return rate, beta1
@@ -475,7 +485,12 @@ class Trainer:
             for value in sorted(set(share.values()))
         ]
         self.optimiser = torch.optim.AdamW(
-            groups, settings.learning_rate, settings.betas, weight_decay=settings.weight_decay, fused=True
+            groups,
+            settings.learning_rate,
+            settings.betas,
+            weight_decay=settings.weight_decay,
+            amsgrad=settings.amsgrad,
+            fused=True,
         )
         self.ema = {n: p.detach().clone() for n, p in self.parameters.items()} if settings.ema_decay else None
         self.steps_done = 0
@@ -612,10 +627,14 @@ class Trainer:
         directory = Path(directory)
         state = json.loads((directory / "state.json").read_text())
         mine = json.loads(json.dumps(asdict(self.settings)))
+        defaults = json.loads(
+            json.dumps({field.name: field.default for field in fields(self.settings) if field.default is not MISSING})
+        )
         for name, value in mine.items():
-            if state["settings"].get(name) != value:
+            stored = state["settings"].get(name, defaults.get(name))  # Earlier versions had fewer options.
+            if stored != value:
                 raise ValueError(
-                    f"{directory}: the checkpoint was trained with {name}={state['settings'].get(name)}, "
+                    f"{directory}: the checkpoint was trained with {name}={stored}, "
                     f"asked for {value}; "
                     "use the same options to resume, or another --name for a new run"
                 )

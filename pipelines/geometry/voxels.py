@@ -25,8 +25,9 @@ from typing import NamedTuple
 import numpy as np
 
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, Grid, Scene
+from models.voxel_grids import CLASS_BITS, NUM_CLASSES
 from pipelines.geometry.rasterize import concatenate_ranges
-from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, list_ground_ids
+from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, list_ground_ids
 
 # Fine categories come before coarse ones. A traffic sign inside a tree crown is visible. A hedge inside a building is
 # hidden.
@@ -45,12 +46,10 @@ PRECEDENCE = (
 )
 EDGE_M = 1e-9  # A voxel centre within this distance of a primitive's boundary counts as inside.
 LEVEL_AXIS = 1e-12  # A unit axis with |z| below this value counts as horizontal.
-NUM_CLASSES = len(CLASS_COLORS)
-CLASS_BITS = int(NUM_CLASSES - 1).bit_length()
 MAX_LEVELS = 64  # Number of bits in the integer of a column.
 PART_COLUMNS = 2**20  # Number of columns that are processed together (100 MB).
 
-assert sorted(PRECEDENCE) == sorted(CATEGORIES) and EMPTY == 0
+assert sorted(PRECEDENCE) == sorted(CATEGORIES) and len(CLASS_COLORS) == NUM_CLASSES
 
 
 @dataclass(frozen=True)

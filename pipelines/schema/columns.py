@@ -11,6 +11,7 @@ import json
 import pyarrow as pa
 
 from models.scene import CATEGORIES, GROUND_CLASSES
+from models.voxel_grids import COARSE_FACTORS, NUM_CLASSES, name_voxel_column
 from pipelines.runtime import storage
 
 TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
@@ -239,6 +240,28 @@ TRAFFIC = _make_schema(
     ("pedestrians",       pa.int32(), "1", "Number of pedestrians in the simulation."),
     ("mean_distance_m",   pa.float64(), "m",   "Mean route length of arrived vehicles."),
     ("mean_speed_mps",    pa.float64(), "m/s", "Mean speed of arrived vehicles."),
+)
+
+
+VOXELS = _make_schema(
+    "One row per scene: class ids of semantic voxels [row, col, level], from jobs/voxelize_scenes.py or from a voxel "
+    "model. Each grid is one zstd frame of unsigned bytes in C order. " + _FRAME,
+    _SCENE_ID,
+    ("rows",         pa.int32(),   "1", "Number of rows of the fine grid; row 0 is the farthest ahead."),
+    ("cols",         pa.int32(),   "1", "Number of columns of the fine grid; column 0 is the leftmost."),
+    ("levels",       pa.int32(),   "1", "Number of levels of the fine grid; level 0 is the lowest."),
+    ("resolution_m", pa.float64(), "m", "Edge length of a fine voxel along x and y."),
+    ("level_m",      pa.float64(), "m", "Height of a fine voxel."),
+    ("front_m",      pa.float64(), "m", "x of the far side of the grid in the scene frame."),
+    ("left_m",       pa.float64(), "m", "y of the left side of the grid in the scene frame."),
+    ("bottom_m",     pa.float64(), "m", "z of the lower side of the grid in the scene frame."),
+    ("num_voxels",   pa.list_(pa.int64(), NUM_CLASSES), "1",
+     "Number of fine voxels of each class id: 0 empty, then the classes of docs/how_to/import_scenes.md."),
+    ("voxels",       pa.binary(),  "", "Fine voxels: rows x cols x levels bytes after decompression."),
+    *[(name_voxel_column(factor), pa.binary(), "",
+       f"Voxels of {' x '.join(map(str, factor))} fine voxels: the most frequent class that is not empty, the lowest of "
+       "equally frequent ones; null if not requested.")
+      for factor in COARSE_FACTORS],
 )
 
 

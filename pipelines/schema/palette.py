@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from models.scene import CATEGORIES, GROUND_CLASSES, Scene
+from models.voxel_grids import EMPTY as EMPTY
 
-EMPTY = 0
 GROUND_CLASS_ID = {"ground": 1, "terrain": 2, "sidewalk": 3, "parking": 4, "road": 5, "crossing": 17}
 CATEGORY_CLASS_ID = {name: 6 + index for index, name in enumerate(CATEGORIES)}
 CLASS_ID = GROUND_CLASS_ID | CATEGORY_CLASS_ID

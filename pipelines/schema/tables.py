@@ -28,6 +28,7 @@ from pipelines.schema.columns import (
     TEXTS,
     TRACKS,
     TRAFFIC,
+    VOXELS,
 )
 from pipelines.schema.conversion import make_scene_tables, parse_scenes
 from pipelines.schema.validation import validate_shard, validate_table
@@ -98,6 +99,7 @@ class Shard:
             "rejects": REJECTS,
             "tracks": TRACKS,
             "traffic": TRAFFIC,
+            "voxels": VOXELS,
         }.get(table)
         content = storage.read_parquet(self.path(table), columns, schema, encoded)
         with self._naming(table):

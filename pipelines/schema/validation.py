@@ -234,6 +234,13 @@ RULES: Mapping[str, Mapping[str, Callable[[pa.Table, str], None]]] = {
         **dict.fromkeys(("front_m", "left_m"), _NEAR),
         "ground_classes": _validate_classes,
     },
+    "voxels": {
+        "scene_id": _require_present,
+        **dict.fromkeys(("rows", "cols", "levels"), _make_number_rule(1, np.inf, "a finite number of at least 1")),
+        **dict.fromkeys(("resolution_m", "level_m"), _POSITIVE),
+        **dict.fromkeys(("front_m", "left_m", "bottom_m"), _NEAR),
+        "voxels": _require_present,
+    },
     "latents": {"scene_id": _require_present, "mean": _validate_tensors, "logvar": _validate_tensors},
     "street_latents": {"scene_id": _require_present, "ground": _validate_tensors},
     "street_maps": {"map_id": _require_present, "distance_m": _validate_tensors},
@@ -244,8 +251,8 @@ def validate_table(kind: str, table: pa.Table) -> None:
     """Validate the columns of a table that are present.
 
     Args:
-        kind: Name of the table: scenes, primitives, rasters, latents,
-            street_latents or street_maps; other tables have no rules.
+        kind: Name of the table: scenes, primitives, rasters, voxels, latents, street_latents or street_maps; other
+            tables have no rules.
         table: Rows of one file; the columns have the types of the schema.
 
     Raises:
@@ -259,6 +266,9 @@ def validate_table(kind: str, table: pa.Table) -> None:
     if kind == "scenes" and "num_primitives" in table.column_names and len(table):
         most = table["num_primitives"].to_numpy()
         require_within("scene_primitives", int(most.max()), f"row {int(most.argmax())}, column 'num_primitives'")
+    if kind == "voxels" and {"rows", "cols", "levels"} <= set(table.column_names) and len(table):
+        voxels = np.prod([table[name].to_numpy().astype(float) for name in ("rows", "cols", "levels")], axis=0)
+        require_within("scene_voxels", voxels.max(), f"row {int(voxels.argmax())}, columns 'rows', 'cols' and 'levels'")
     if kind == "rasters" and {"height", "occupied", "rows", "cols", "ground_classes"} <= set(table.column_names):
         _validate_rasters(table)
 
