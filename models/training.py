@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -78,6 +78,15 @@ class OptimizerConfig:
     ema_decay: float | None = None
     amsgrad: bool = False
     seed: int = 0
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the options by name, without defaults of options that records of earlier versions lack.
+
+        Returns:
+            Options.
+        """
+        later = {"decay": "cosine", "milestones": (), "amsgrad": False}
+        return {name: value for name, value in asdict(self).items() if name not in later or value != later[name]}
 
     def at(self, step: int) -> tuple[float, float]:
         """Return the learning rate and beta1 of a step.
@@ -610,7 +619,7 @@ class Trainer:
         save_file(
             {name: value.contiguous().cpu() for name, value in tensors.items()}, directory / "training.safetensors"
         )
-        state = {"steps_done": self.steps_done, "settings": asdict(self.settings)}
+        state = {"steps_done": self.steps_done, "settings": self.settings.to_record()}
         temporary = directory / "state.json.tmp"
         temporary.write_text(json.dumps(state, indent=1))
         os.replace(temporary, directory / "state.json")
@@ -626,12 +635,9 @@ class Trainer:
         """
         directory = Path(directory)
         state = json.loads((directory / "state.json").read_text())
-        mine = json.loads(json.dumps(asdict(self.settings)))
-        defaults = json.loads(
-            json.dumps({field.name: field.default for field in fields(self.settings) if field.default is not MISSING})
-        )
-        for name, value in mine.items():
-            stored = state["settings"].get(name, defaults.get(name))  # Earlier versions had fewer options.
+        mine = json.loads(json.dumps(self.settings.to_record()))
+        for name in sorted(mine.keys() | state["settings"].keys()):
+            stored, value = state["settings"].get(name), mine.get(name)
             if stored != value:
                 raise ValueError(
                     f"{directory}: the checkpoint was trained with {name}={stored}, "

@@ -11,7 +11,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -445,4 +445,4 @@ def override_settings(settings: OptimizerConfig, **changes: Any) -> OptimizerCon
 
 def make_run_identity(settings: OptimizerConfig, **more: Any) -> dict:
     """Return the options that determine a run's weights: its optimizer settings and `more`."""
-    return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(settings).items()} | more
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in settings.to_record().items()} | more

@@ -120,7 +120,7 @@ def unpack_voxels(table: pa.Table, row: int, factor: Factor = FINE) -> np.ndarra
     packed = table[name][row].as_buffer()
     if packed is None:
         raise ValueError(
-            f"row {row}, column {name!r}: null; run jobs/voxelize_scenes.py with this size of voxels to another --output"
+            f"row {row}, column {name!r}: null; run jobs/voxelize_scenes.py with these voxels and another --output"
         )
     try:
         content = pa.Codec("zstd").decompress(packed, int(np.prod(shape)))

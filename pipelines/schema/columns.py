@@ -259,8 +259,8 @@ VOXELS = _make_schema(
      "Number of fine voxels of each class id: 0 empty, then the classes of docs/how_to/import_scenes.md."),
     ("voxels",       pa.binary(),  "", "Fine voxels: rows x cols x levels bytes after decompression."),
     *[(name_voxel_column(factor), pa.binary(), "",
-       f"Voxels of {' x '.join(map(str, factor))} fine voxels: the most frequent class that is not empty, the lowest of "
-       "equally frequent ones; null if not requested.")
+       f"Voxels of {' x '.join(map(str, factor))} fine voxels: the most frequent class that is not empty, the lowest "
+       "of equally frequent ones; null if not requested.")
       for factor in COARSE_FACTORS],
 )
 
