@@ -34,6 +34,7 @@ from pipelines.schema.tables import Shard, find_shards, read_scenes
 from pipelines.training.data_loader import LatentReader
 from pipelines.training.latents import load_lvae
 from pipelines.training.street_map_reader import StreetMapReader
+from pipelines.training.voxel_reader import VoxelReader
 
 SHOWN = 4
 PLAN_M = 512.0
@@ -170,6 +171,32 @@ class StreetPlanCheck:
         scores["validation_connectivity"] = float(sizes.max() / sizes.sum()) if len(sizes) else 0.0
         picture = np.where(road, 255, np.where(paved, 128, 0)).astype(np.uint8)
         return scores, {"plan": picture[:, :, None].repeat(3, axis=2)}
+
+
+@dataclass(frozen=True)
+class HeldOutLoss:
+    """Validation of a voxel method: the loss on the first held-out scenes, with the same noise at each validation."""
+
+    shards: list[Shard]
+    reader: VoxelReader
+    count: int = 16
+    batch: int = 4
+
+    @torch.no_grad()
+    def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+        """Return the mean of each part of the loss, and no pictures."""
+        model = trainer.ema_model().eval()
+        found = self.shards[0].read("voxels", ["scene_id"]).num_rows
+        totals: dict[str, float] = {}
+        for start in range(0, min(self.count, found), self.batch):
+            rows = np.arange(start, min(start + self.batch, self.count, found))
+            samples = self.reader(self.shards[0], rows).items()
+            arrays = {name: torch.from_numpy(value).to(trainer.device) for name, value in samples}
+            losses = trainer.loss(model, arrays, [make_keyed_generator(1, k) for k in rows.tolist()])
+            for name, value in losses.items():
+                totals[name] = totals.get(name, 0.0) + float(value) * len(rows) / min(self.count, found)
+        model.train()
+        return {f"validation_{name}": value for name, value in totals.items()}, {}
 
 
 @lru_cache(maxsize=1)

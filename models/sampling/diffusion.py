@@ -108,10 +108,15 @@ class SamplingSchedule:
         num_inference_steps: Number of timesteps that sampling uses.
         eta: Fraction of the noise of DDPM that each step adds (DDIM; Song et al., 2021). The paper uses 1; 0 adds no
             noise.
+        large_variance: Whether each step adds noise of the variance beta instead of that of the posterior, the other
+            choice of DDPM (Ho et al., 2020, Sec. 3.2). It needs eta 1.
     """
 
-    def __init__(self, diffusion: Diffusion, num_inference_steps: int, eta: float = 1.0) -> None:
+    def __init__(
+        self, diffusion: Diffusion, num_inference_steps: int, eta: float = 1.0, large_variance: bool = False
+    ) -> None:
         self.timesteps, self.eta = diffusion.select_timesteps(num_inference_steps), eta
+        self.large_variance = large_variance
         self.alpha_bar = np.append(diffusion.alpha_bar[self.timesteps], 1.0)  # The last entry is the clean state.
 
     def __len__(self) -> int:
@@ -171,6 +176,7 @@ class SamplingSchedule:
         variance = self.eta**2 * (1 - a_prev) / (1 - a) * (1 - a / a_prev)
         clean = (latent - (1 - a) ** 0.5 * predicted_noise) / a**0.5
         mean = a_prev**0.5 * clean + (1 - a_prev - variance) ** 0.5 * predicted_noise
+        variance = 1 - a / a_prev if self.large_variance else variance
         return mean if state == 0 else mean + variance**0.5 * noise
 
 
@@ -252,8 +258,35 @@ class SceneNoise:
     ) -> None:
         seeds = [seed] * len(indices) if isinstance(seed, int) else seed
         keys = [(index,) if isinstance(index, int) else index for index in indices]
-        self.generators = [make_keyed_generator(one, *key, purpose) for one, key in zip(seeds, keys, strict=True)]
-        self.shape, self.device = shape, torch.device(device)
+        generators = [make_keyed_generator(one, *key, purpose) for one, key in zip(seeds, keys, strict=True)]
+        self._use_generators(generators, shape, device, ahead)
+
+    @classmethod
+    def from_generators(
+        cls, generators: Sequence[torch.Generator], shape: tuple[int, ...], device: torch.device | str
+    ) -> SceneNoise:
+        """Return noise of given generators, which are advanced by each draw.
+
+        Args:
+            generators: One generator of the CPU per scene.
+            shape: Shape of the noise of one scene.
+            device: Device of the noise.
+
+        Returns:
+            Noise.
+        """
+        noise = cls.__new__(cls)
+        noise._use_generators(list(generators), shape, device, ahead=False)
+        return noise
+
+    def _use_generators(
+        self,
+        generators: list[torch.Generator],
+        shape: tuple[int, ...],
+        device: torch.device | str,
+        ahead: bool | None,
+    ) -> None:
+        self.generators, self.shape, self.device = generators, shape, torch.device(device)
         self.ahead = self.device.type == "cuda" if ahead is None else ahead
         self.next = self._start() if self.ahead else None  # Noise of the next call.
 

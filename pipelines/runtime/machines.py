@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+MEMORY, CONTROL_GROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 PROCESSES = Path("/proc/self/ns/pid")  # Containers of one machine have different process ids.
 
 
@@ -58,3 +59,20 @@ def is_process_alive(process: int, start_time: str = "") -> bool:
     except (PermissionError, OverflowError):  # a process of another user; no such id can exist
         return process < 2**31
     return True
+
+
+def find_available_bytes() -> float:
+    """Return the memory in bytes that new processes of this container can use, or infinity if it is unknown.
+
+    Returns:
+        The smaller of the available memory of the machine and the free part of the limit of the container.
+    """
+    found = [float("inf")]
+    try:
+        lines = MEMORY.read_text().splitlines()
+        found += [1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+        limit, used = ((CONTROL_GROUP / name).read_text().strip() for name in ("memory.max", "memory.current"))
+        found += [float(limit) - float(used)] if limit != "max" else []
+    except (OSError, ValueError, IndexError):  # not Linux, or no limit
+        pass
+    return max(min(found), 0.0)
