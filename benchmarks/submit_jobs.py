@@ -41,6 +41,9 @@ OTHERS = re.compile(  # Lines of Ray and MLflow, bars of progress and tables.
 # @ is the home directory.
 JOBS = """
 preprocess_scenes town --num-train 48 --num-test 24
+voxelize_scenes --input @/datasets/town
+train_baseline semcity --preset smoke --dataset @/datasets/town
+sample_baseline --model @/models/semcity-smoke --num-scenes 4
 train_lvae smoke --dataset @/datasets/town --name small-lvae --steps 24
 encode_latents --dataset @/datasets/town --lvae @/models/small-lvae
 train_dit smoke --dataset @/datasets/town --name small --steps 24 --num-workers 2

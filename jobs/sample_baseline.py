@@ -1,14 +1,15 @@
 #!/usr/bin/env python3
-"""Generate, reconstruct, inpaint or outpaint scenes with a voxel method of train_baseline.py.
+"""Generate, reconstruct, inpaint or outpaint scenes with a voxel method.
 
     jobs/sample_baseline.py --model $PRITTI_HOME/models/semcity-town --num-scenes 64
     jobs/sample_baseline.py --model DIR --task reconstruct --input $PRITTI_HOME/datasets/town --split test
     jobs/sample_baseline.py --model DIR --task inpaint --input DATASET --half left
     jobs/sample_baseline.py --model DIR --task outpaint --input DATASET --windows 3 3 --num-scenes 4
 
-The job writes the table voxels with source=generated-<run>, and one source per coarser level of PDD and XCube, all with
-voxels of 0.25 m. It also writes <run>.png, a contact sheet, and <run>.npz, pictures for evaluate_scenes.py. Scene i
-depends only on --seed and i. Run the same command again to resume after an interruption.
+The model is a directory of train_baseline.py. The job writes the table voxels with source=generated-<run>, and one
+source per coarser level of PDD and XCube, all with voxels of 0.25 m. It also writes <run>.png, a contact sheet, and
+<run>.npz, pictures for evaluate_scenes.py. Scene i depends only on --seed and i. Run the same command again to resume
+after an interruption.
 """
 
 from __future__ import annotations

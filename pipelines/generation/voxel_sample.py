@@ -76,16 +76,37 @@ class VoxelSampleRequest:
             raise ValueError(f"task {self.task} {'reads no' if self.dataset else 'needs a'} dataset")
 
     def source(self, factor: Factor = FINE) -> str:
-        """Return the source of the scenes of a level."""
+        """Return the source of the scenes of a level.
+
+        Args:
+            factor: Size of the voxels of a coarser level, or FINE for the result.
+
+        Returns:
+            Value of the source column.
+        """
         return f"generated-{self.run}{'' if factor == FINE else name_voxel_column(factor).replace('voxels_', '-')}"
 
     def shards(self, factor: Factor = FINE) -> list[Shard]:
-        """Return the shards of a level."""
+        """Return the shards of a level.
+
+        Args:
+            factor: Size of the voxels of a coarser level, or FINE for the result.
+
+        Returns:
+            All shards.
+        """
         count = -(-self.num_scenes // self.shard_scenes)
         return [Shard(self.output, self.source(factor), "generated", k) for k in range(count)]
 
     def indices(self, number: int) -> range:
-        """Return the numbers of the scenes of a shard."""
+        """Return the numbers of the scenes of a shard.
+
+        Args:
+            number: Number of the shard.
+
+        Returns:
+            Numbers.
+        """
         return range(number * self.shard_scenes, min((number + 1) * self.shard_scenes, self.num_scenes))
 
 
@@ -203,6 +224,12 @@ def make_generated_row(scene_id: str, voxels: Tensor, factor: Factor) -> dict:
 
 def list_given_scenes(request: VoxelSampleRequest) -> list[tuple[Shard, int]]:
     """Return the shard and the row of the first scenes of the dataset.
+
+    Args:
+        request: Options.
+
+    Returns:
+        One pair per scene.
 
     Raises:
         ValueError: The dataset has no voxels, or fewer scenes than requested.

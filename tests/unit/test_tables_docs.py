@@ -24,6 +24,8 @@ from helpers import ROOT, make_straight_drive, random_scene
 from models.scene import CATEGORIES, UNSET, VEGETATION, VEHICLES, Grid, Scene, make_yaw_rotation
 from pipelines.editing.edit import Remove, Select
 from pipelines.generation.batch_edit import EditRequest, edit_shard
+from pipelines.geometry.voxels import VoxelGrid, voxelize
+from pipelines.io.voxel_table import make_voxel_row, make_voxel_table
 from pipelines.preprocess.sources import argoverse2, kitti360
 from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.preprocess.street_maps import write_street_maps
@@ -38,6 +40,7 @@ from pipelines.schema.columns import (
     SCENES,
     TRACKS,
     TRAFFIC,
+    VOXELS,
     make_latents_schema,
     make_street_latents_schema,
     make_street_maps_schema,
@@ -56,6 +59,7 @@ SCHEMAS = {
     "edits": EDITS,
     "tracks": TRACKS,
     "traffic": TRAFFIC,
+    "voxels": VOXELS,
     "latents": make_latents_schema((4, 8, 8)),
     "street_latents": make_street_latents_schema((2, 8, 8)),
     "street_maps": make_street_maps_schema((2, 64, 64)),
@@ -197,6 +201,8 @@ def root(town, generated_scenes, rejects, tmp_path_factory) -> Path:
     storage.write_parquet(make_tracks_table(ids[0].as_py(), make_straight_drive()), shard.path("tracks"))
     row = make_traffic_row(ids[0].as_py(), False, None, "the scene has no road")
     storage.write_parquet(pa.Table.from_pylist([row], schema=TRAFFIC), shard.path("traffic"))
+    voxels = [make_voxel_row(s.scene_id, voxelize(s, VoxelGrid(s.grid)), VoxelGrid(s.grid), ()) for s in town[:1]]
+    storage.write_parquet(make_voxel_table(voxels), shard.path("voxels"))
     write_street_maps([random_scene(0, grid=Grid(256.0, 128.0, 0.5, 512, 512))], shard)
     return path
 
@@ -388,7 +394,8 @@ def test_tables_page_reject_reasons(answers, rejects):
 
 
 def test_tables_page_python_blocks_run(root, town, capsys):
-    decoder, script = (code for _, code in find_code_blocks("python"))
+    voxels, decoder, script = (code for _, code in find_code_blocks("python"))
+    exec(replace_folders(voxels, root), {})
     assert decoder.split("\n\n\n")[1].strip() in script
     names: dict = {}
     exec(replace_folders(script, root), names)

@@ -194,6 +194,14 @@ class PlaneBlock(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, plane: Tensor) -> Tensor:
+        """Apply the block.
+
+        Args:
+            plane: (b, channels, height, width).
+
+        Returns:
+            (b, out_channels, height, width).
+        """
         return self.shortcut(plane) + self.second(F.silu(self.norm(self.first(plane))))
 
 

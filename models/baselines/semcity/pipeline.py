@@ -65,14 +65,43 @@ class Pipeline(VoxelPipeline):
         return sample(self._denoise(), schedule, noise, label, jumps, condition)
 
     def sample(self, generators: Sequence[torch.Generator]) -> Grids:
+        """Generate scenes by DDPM with all timesteps.
+
+        Args:
+            generators: One generator per scene. A scene depends only on its generator.
+
+        Returns:
+            Grids of the only level.
+        """
         return {self.factors[0]: self.autoencoder.decode_voxels(self._sample_triplanes(generators))}
 
     @torch.no_grad()
     def reconstruct(self, voxels: Tensor) -> Tensor:
+        """Encode scenes to triplanes, and decode the most probable class of each voxel.
+
+        Args:
+            voxels: (n, rows, cols, levels) uint8 grids.
+
+        Returns:
+            (n, rows, cols, levels) uint8.
+        """
         return self.autoencoder.decode_voxels(self.autoencoder.encode(voxels.to(self.device)))
 
     @torch.no_grad()
     def inpaint(self, voxels: Tensor, unknown: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
+        """Generate a part of given scenes by RePaint on planes.
+
+        The scene is encoded with empty voxels in unknown columns. Cells of the planes that depend on unknown columns
+        are generated.
+
+        Args:
+            voxels: (n, rows, cols, levels) uint8 grids.
+            unknown: (n, rows, cols) bool: columns to generate.
+            generators: One generator per scene.
+
+        Returns:
+            (n, rows, cols, levels) uint8.
+        """
         voxels, unknown = voxels.to(self.device), unknown.to(self.device)
         known = torch.where(unknown[..., None], EMPTY, voxels)
         latent = self.autoencoder.encode(known)

@@ -165,6 +165,15 @@ class PlaneLayer(nn.Module):
         self.layers = nn.ModuleList(make(is_vertical) for is_vertical in (False, True, True))
 
     def forward(self, planes: Planes, emb: Tensor | None = None) -> Planes:
+        """Apply the layers.
+
+        Args:
+            planes: Planes.
+            emb: Embedding of the timestep, which these layers ignore.
+
+        Returns:
+            Planes.
+        """
         return Planes(*(layer(plane) for layer, plane in zip(self.layers, planes, strict=True)))
 
 
@@ -216,6 +225,15 @@ class RolloutConv(PlaneLayer):
         super().__init__(lambda is_vertical: nn.Conv2d(3 * channels, out_channels, 3, padding=1))
 
     def forward(self, planes: Planes, emb: Tensor | None = None) -> Planes:
+        """Apply the convolution.
+
+        Args:
+            planes: Planes.
+            emb: Embedding of the timestep, which this layer ignores.
+
+        Returns:
+            Planes.
+        """
         xy, xz, yz = planes
         along_x = xy.mean(3)[:, :, :, None], xz.mean(3)[:, :, :, None]  # (b, c, rows, 1)
         along_y = xy.mean(2)[:, :, :, None], yz.mean(3)[:, :, None, :]  # (b, c, cols, 1) and (b, c, 1, cols)
@@ -242,6 +260,15 @@ class PlaneResBlock(nn.Module):
                 nn.init.zeros_(parameter)
 
     def forward(self, planes: Planes, emb: Tensor) -> Planes:
+        """Apply the block.
+
+        Args:
+            planes: Planes.
+            emb: (b, emb) embedding of the timestep.
+
+        Returns:
+            Planes.
+        """
         x = self.conv(map_planes(F.silu, self.norm(planes)))
         scale, shift = self.embed(F.silu(emb))[:, :, None, None].chunk(2, dim=1)
         x = map_planes(lambda plane: F.silu(plane * (1 + scale) + shift), self.norm_after(x))
