@@ -66,7 +66,12 @@ def test_kl_equals_enumeration_in_float64():
                 model /= model.sum()
                 true = make_posterior(diffusion, clean, noisy, t)
                 expected = torch.special.xlogy(true, true).sum() - (true * model.log()).sum()
-                args = predicted.log().view(1, 3, 1), torch.tensor([[clean]]), torch.tensor([[noisy]]), torch.tensor([t])
+                args = (
+                    predicted.log().view(1, 3, 1),
+                    torch.tensor([[clean]]),
+                    torch.tensor([[noisy]]),
+                    torch.tensor([t]),
+                )
                 assert diffusion.compute_kl(*args).item() == pytest.approx(expected.item(), abs=1e-12)
 
 
@@ -113,18 +118,16 @@ def test_weights_of_timesteps_keep_the_mean_of_the_loss():
     clean, noisy = (torch.randint(0, 3, shape, generator=generator) for _ in range(2))
     logits = torch.randn(12, 3, 2, 2, 2, generator=generator, dtype=torch.float64)
     timestep = torch.arange(12)
-    each = [
+    parts = [
         diffusion.compute_losses(logits[k, None], clean[k, None], noisy[k, None], timestep[k, None], weights[k, None])
         for k in range(12)
     ]
+    bound, loss = (torch.stack([weights[k] * parts[k][name] for k in range(12)]).sum() for name in ("bound", "loss"))
     kl = diffusion.compute_kl(logits.log_softmax(1), clean, noisy, timestep).sum((1, 2, 3)) / 4  # Per column.
-    expected = kl.sum() + 2 * diffusion.compute_prior_kl()
-    assert sum(w * part["bound"] for w, part in zip(weights, each, strict=True)).item() == pytest.approx(expected.item())
+    assert bound.item() == pytest.approx((kl.sum() + 2 * diffusion.compute_prior_kl()).item())
     entropy = torch.nn.functional.cross_entropy(logits, clean, reduction="none").sum((1, 2, 3)) / 4
     entropy[0] = kl[0]
-    auxiliary = 5e-4 * ((2 - timestep / 12) * entropy).sum()
-    total = sum(w * part["loss"] for w, part in zip(weights, each, strict=True))
-    assert (total.item() - expected.item()) == pytest.approx(auxiliary.item())
+    assert (loss - bound).item() == pytest.approx((5e-4 * (2 - timestep / 12) * entropy).sum().item())
 
 
 def test_noise_keeps_classes_with_the_right_probability():
@@ -155,7 +158,7 @@ def test_categorical_frequencies_match_probabilities():
 
 @pytest.mark.parametrize("steps", [3, 20])
 def test_sampler_reproduces_independent_classes(steps):
-    """For independent voxels, the distribution given all other voxels is the prior, and any number of steps is exact."""
+    """The network of independent voxels returns the prior, and the sampler is exact for any number of steps."""
     diffusion = MultinomialDiffusion(3, steps)
 
     def denoise(noisy, timestep):
