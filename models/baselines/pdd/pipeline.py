@@ -240,14 +240,14 @@ PRESETS: dict[str, tuple[Stage, ...]] = {
         num_timesteps=4,
         fine_shape=(32, 32, 32),
     ),
-    # For two CPU cores.
+    # For two CPU cores. AdamW with a rate of 4e-3 learns no faster at this width.
     "town": make_stages(
         ((16, 32, 64, 128, 256),) * 3,
         heads=32,
         block=64,
-        batch_sizes=(16, 8, 2),
-        steps=(20_000, 20_000, 20_000),
-        optimizer=OptimizerConfig(20_000, 1e-3, 0.01, warmup_steps=100, grad_clip=1.0, ema_decay=0.999),
+        batch_sizes=(16, 4, 2),
+        steps=(6_000, 4_000, 8_000),
+        optimizer=OptimizerConfig(6_000, 1e-3, 0.01, warmup_steps=100, grad_clip=1.0, ema_decay=0.999),
     ),
     # The paper reports one, two and 14 days of training on four A100s but not the number of steps.
     "paper": make_stages(
