@@ -13,6 +13,7 @@ from models.baselines.pdd.pipeline import (
     generate_level,
     make_condition,
     make_level_loss,
+    make_stages,
     mirror_neighbors,
     upsample_classes,
 )
@@ -21,18 +22,17 @@ from models.voxel_grids import FINE_SHAPE, NUM_CLASSES, coarsen_shape, name_voxe
 
 CPU = torch.device("cpu")
 COUNTS = [1000] * NUM_CLASSES
+# Stages of small networks for scenes of 32 x 32 x 32 voxels.
+STAGES = make_stages(
+    ((4, 8),) * 3, 4, 16, (4, 4, 4), (8, 8, 8), OptimizerConfig(8, 4e-3, 0.01, ema_decay=0.9), 2, (32, 32, 32)
+)
 
 
 def make_networks(**changes) -> dict[str, PyramidDenoiser]:
-    """Return small networks with random weights, by level. Each sees two timesteps.
-
-    The networks are in float64, so rounding does not change classes.
-    """
+    """Return networks with random weights in float64, so that rounding does not change classes."""
     torch.manual_seed(0)
-    small = {"widths": (4, 8), "num_timesteps": 2}
     return {
-        stage.name: PyramidDenoiser(**stage.architecture | small | changes.get(stage.name, {})).double()
-        for stage in PRESETS["smoke"]
+        stage.name: PyramidDenoiser(**stage.architecture | changes.get(stage.name, {})).double() for stage in STAGES
     }
 
 
@@ -61,10 +61,10 @@ def measure_miou(found: torch.Tensor, expected: torch.Tensor) -> float:
 
 
 def make_arrays(batch: int) -> dict[str, torch.Tensor]:
-    """Return random training samples of all levels of the preset smoke."""
+    """Return random training samples of all levels."""
     generator = torch.Generator().manual_seed(4)
     arrays = {}
-    for stage in PRESETS["smoke"]:
+    for stage in STAGES:
         shape = (batch, *stage.architecture["shape"])
         name = name_voxel_column(stage.factors[-1])
         arrays[name] = torch.randint(0, NUM_CLASSES, shape, generator=generator, dtype=torch.uint8)
@@ -80,7 +80,7 @@ def test_paper_preset_has_the_size_of_the_original(number):
     assert stage.batch_size == (16, 16, 4)[number] and stage.optimizer.learning_rate == 4e-3
 
 
-@pytest.mark.parametrize("preset", ["town", "paper"])
+@pytest.mark.parametrize("preset", PRESETS)
 def test_presets_have_the_levels_of_the_paper(preset):
     stages = PRESETS[preset]
     assert tuple(stage.name for stage in stages) == LEVELS
@@ -88,7 +88,7 @@ def test_presets_have_the_levels_of_the_paper(preset):
     assert shapes == [(32, 32, 4), (64, 64, 8), (256, 256, 16)]
     assert [coarsen_shape(FINE_SHAPE, stage.factors[-1]) for stage in stages] == shapes
     assert [len(stage.factors) for stage in stages] == [1, 2, 2]
-    block = {"town": 64, "paper": 128}[preset]
+    block = {"smoke": 32, "town": 64, "paper": 128}[preset]
     assert stages[2].architecture["block"] == (block, block) and stages[2].architecture["strip"] == block // 16
 
 
@@ -115,7 +115,7 @@ def test_config_with_wrong_values_is_rejected(changes, message):
 
 def test_network_is_loaded_with_equal_outputs(tmp_path):
     torch.manual_seed(0)
-    stage = PRESETS["smoke"][2]
+    stage = STAGES[2]
     network = PyramidDenoiser.from_config(stage.architecture).eval()
     network.save_pretrained(tmp_path)
     loaded = PyramidDenoiser.from_pretrained(tmp_path)
@@ -173,7 +173,7 @@ def test_condition_shows_the_coarse_voxels_of_the_block():
 
 @pytest.mark.parametrize("number", range(3))
 def test_loss_of_each_sample_depends_only_on_its_generator(number):
-    stage = PRESETS["smoke"][number]
+    stage = STAGES[number]
     network = make_networks()[stage.name]
     loss, arrays = stage.make_loss(network, {}, COUNTS), make_arrays(3)
     together = loss(network, arrays, make_generators(1, 2, 3))
@@ -187,7 +187,7 @@ def test_loss_of_each_sample_depends_only_on_its_generator(number):
 
 def test_loss_trains_the_block_of_the_scene_that_it_noises():
     """A network that sees only unmixed scenes returns the clean classes, so its loss is almost zero."""
-    stage = PRESETS["smoke"][2]
+    stage = STAGES[2]
     network = make_networks()["level3"]
     arrays = {
         name: torch.full((2, *shape), 7, dtype=torch.uint8)
@@ -206,7 +206,7 @@ def test_loss_trains_the_block_of_the_scene_that_it_noises():
 
 
 def test_training_resumes_exactly(tmp_path):
-    stage, arrays = PRESETS["smoke"][1], make_arrays(2)
+    stage, arrays = STAGES[1], make_arrays(2)
 
     def make_trainer() -> Trainer:
         torch.manual_seed(0)

@@ -229,16 +229,14 @@ def make_stages(
 
 
 PRESETS: dict[str, tuple[Stage, ...]] = {
-    # For scenes of 32 x 32 x 32 voxels, as those of the preset smoke of the layout VAE.
     "smoke": make_stages(
-        ((8, 8), (8, 16), (8, 16)),
+        ((4, 8), (4, 8), (4, 8)),
         heads=4,
-        block=16,
-        batch_sizes=(4, 4, 4),
+        block=32,
+        batch_sizes=(4, 2, 2),
         steps=(8, 8, 8),
         optimizer=OptimizerConfig(8, 4e-3, 0.01, ema_decay=0.9),
-        num_timesteps=4,
-        fine_shape=(32, 32, 32),
+        num_timesteps=2,
     ),
     # For two CPU cores. AdamW with a rate of 4e-3 learns no faster at this width.
     "town": make_stages(
