@@ -159,7 +159,12 @@ def gather_rows(x: Float[Tensor, "n c"], table: Int[Tensor, "m k"]) -> Float[Ten
     Returns:
         Joined features.
     """
-    return F.pad(x, (0, 0, 0, 1)).index_select(0, table.reshape(-1)).view(len(table), table.shape[1] * x.shape[1])
+    return _take_rows(F.pad(x, (0, 0, 0, 1)), table)
+
+
+def _take_rows(padded: Tensor, table: Tensor) -> Tensor:
+    """Join the rows (n + 1, c) that a table (m, k) lists; the result is (m, kc)."""
+    return padded.index_select(0, table.reshape(-1)).view(len(table), table.shape[1] * padded.shape[1])
 
 
 class _GatherConvolution(torch.autograd.Function):
@@ -180,8 +185,7 @@ class _GatherConvolution(torch.autograd.Function):
         padded = F.pad(x, (0, 0, 0, 1))
         rows = _count_rows(x)
         for part, of_part in zip(table.split(rows), grad.split(rows), strict=True):
-            gathered = padded.index_select(0, part.reshape(-1)).view(len(part), -1)
-            grad_weight += (gathered.T @ of_part).view(weight.shape)
+            grad_weight += (_take_rows(padded, part).T @ of_part).view(weight.shape)
         return grad_x, grad_weight.to(weight.dtype), None
 
 
@@ -191,12 +195,9 @@ def _count_rows(x: Tensor) -> int:
 
 
 def _convolve(x: Tensor, weight: Tensor, table: Tensor) -> Tensor:
-    if not len(table):
-        return x.new_zeros(0, weight.shape[2])
+    """Return the sum over k of x[table[:, k]] @ weight[k]."""
     padded, matrix = F.pad(x, (0, 0, 0, 1)), weight.reshape(-1, weight.shape[2])
-    parts = table.split(_count_rows(x))
-    # A view with explicit sizes is valid for an empty table, too.
-    return torch.cat([padded.index_select(0, p.reshape(-1)).view(len(p), len(matrix)) @ matrix for p in parts])
+    return torch.cat([_take_rows(padded, part) @ matrix for part in table.split(_count_rows(x))])
 
 
 class SparseConvolution(nn.Module):

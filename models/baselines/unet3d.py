@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from models.dit import embed_timesteps
 
 TIMESTEP_FEATURES = 256  # Of `embed_timesteps`.
-MAX_GROUPS = 32
+MAX_GROUPS, GROUP_WIDTH = 32, 4
 HEAD_WIDTH = 32
 
 
@@ -41,7 +41,9 @@ class TimestepEmbedding(nn.Module):
 
 
 def make_norm(channels: int) -> nn.GroupNorm:
-    """Return a group normalisation with the largest number of groups up to MAX_GROUPS.
+    """Return a group normalisation with at most MAX_GROUPS groups of at least GROUP_WIDTH channels, if possible.
+
+    With one channel per group, the normalised value of a grid of a single voxel would always be zero.
 
     Args:
         channels: Number of channels.
@@ -49,7 +51,7 @@ def make_norm(channels: int) -> nn.GroupNorm:
     Returns:
         Normalisation.
     """
-    return nn.GroupNorm(math.gcd(MAX_GROUPS, channels), channels)
+    return nn.GroupNorm(math.gcd(MAX_GROUPS, channels, 2 ** int(math.log2(max(1, channels / GROUP_WIDTH)))), channels)
 
 
 class ResidualBlock3D(nn.Module):

@@ -26,7 +26,7 @@ from models.voxel_grids import NUM_CLASSES
 XCUBE_SCHEDULE = Diffusion(num_timesteps=1000, beta_start=1e-4, beta_end=0.02)
 COMMON_RULES: dict[str, Rule] = {
     "channels": Integer(1, 1024),
-    "width": Integer(1, 4096),
+    "width": Integer(8, 4096),
     "multipliers": Sequential(Integer(1, 64), 1, 8),
     "blocks": Integer(1, 16),
     "scale": Number(1e-6, 1e6),
@@ -145,7 +145,9 @@ class CoarseDiffusion(LatentDiffusion):
         config = super().parse_config(config)
         for level in config["attention"]:
             if level >= len(config["multipliers"]):
-                raise ValueError(f"attention contains level {level}, expected levels below {len(config['multipliers'])}")
+                raise ValueError(
+                    f"attention contains level {level}, expected levels below {len(config['multipliers'])}"
+                )
             channels = config["width"] * config["multipliers"][level]
             if channels > HEAD_WIDTH and channels % HEAD_WIDTH:
                 raise ValueError(f"level {level} has {channels} channels, expected a multiple of {HEAD_WIDTH}")
@@ -207,7 +209,9 @@ class FineDiffusion(LatentDiffusion):
 
         def make_blocks(before: int, after: int) -> nn.ModuleList:
             sizes = [before, *(after,) * blocks]
-            return nn.ModuleList([SparseResidualBlock(*pair, embedding) for pair in zip(sizes, sizes[1:], strict=False)])
+            return nn.ModuleList(
+                [SparseResidualBlock(*pair, embedding) for pair in zip(sizes, sizes[1:], strict=False)]
+            )
 
         self.down = nn.ModuleList([make_blocks(*pair) for pair in zip([width, *widths], widths, strict=False)])
         self.downsample = nn.ModuleList([SparseDownsample(n, n) for n in widths[:-1]])

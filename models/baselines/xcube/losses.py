@@ -18,7 +18,7 @@ from models.voxel_grids import FINE, Factor
 
 COARSE: Factor = (4, 4, 4)
 COARSE_VAE, FINE_VAE, COARSE_DIFFUSION, FINE_DIFFUSION = "coarse_vae", "fine_vae", "coarse_diffusion", "fine_diffusion"
-MEASURED_SCENES = 16  # Scenes whose latents give the standard deviation.
+MEASURED_SCENES = 8  # Scenes whose latents give the standard deviation.
 
 
 def crop_grids(fine: Tensor, coarse: Tensor, uniform: Tensor, crop: int) -> tuple[Tensor, Tensor]:
@@ -208,5 +208,3 @@ def encode_scenes(vae: VoxelVAE, voxels: Tensor, coarse: Tensor | None) -> tuple
     mask = torch.cat([posterior.sites.mask for posterior in posteriors])
     mean, logvar = (torch.cat(parts) for parts in zip(*(p[:2] for p in posteriors), strict=True))
     return mean, logvar, Sites.from_mask(mask)
-
-

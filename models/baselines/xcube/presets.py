@@ -66,9 +66,7 @@ def make_stages(sizes: Sizes) -> tuple[Stage, ...]:
             return OptimizerConfig(steps, sizes.learning_rates[1], 0.0, ema_decay=0.9999)
         every = max(1, DECAY_SAMPLES // batch_size)
         milestones = tuple((step, DECAY_FACTOR) for step in range(every, steps, every))
-        return OptimizerConfig(
-            steps, sizes.learning_rates[0], 0.01, milestones=milestones, amsgrad=True, grad_clip=0.5
-        )
+        return OptimizerConfig(steps, sizes.learning_rates[0], 0.01, milestones=milestones, amsgrad=True, grad_clip=0.5)
 
     coarse_vae = {"widths": sizes.coarse_widths, "kl_weight": 0.03}
     fine_vae = {"widths": sizes.fine_widths, "kl_weight": 0.3, "condition_channels": 32}
@@ -137,7 +135,7 @@ PRESETS: dict[str, tuple[Stage, ...]] = {
             coarse_diffusion={"width": 32},
             fine_diffusion={"width": 32, "blocks": 1},
             crop=16,
-            steps=(2_000, 1_500, 4_000, 3_000),
+            steps=(2_000, 3_000, 2_800, 4_500),
             batch_sizes=(4, 2, 16, 4),
             learning_rates=(1e-3, 2e-4),
         )
