@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from models.dit import embed_timesteps
 
 TIMESTEP_FEATURES = 256  # Of `embed_timesteps`.
+Layer = TypeVar("Layer", nn.Linear, nn.Conv3d)
 MAX_GROUPS, GROUP_WIDTH = 32, 4
 HEAD_WIDTH = 32
 
@@ -26,7 +28,7 @@ class TimestepEmbedding(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.layers = nn.Sequential(nn.Linear(TIMESTEP_FEATURES, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
+        self.first, self.second = nn.Linear(TIMESTEP_FEATURES, width), nn.Linear(width, width)
 
     def forward(self, timestep: Int[Tensor, " b"]) -> Float[Tensor, "b width"]:
         """Embed timesteps.
@@ -37,7 +39,8 @@ class TimestepEmbedding(nn.Module):
         Returns:
             Vectors.
         """
-        return self.layers(embed_timesteps(timestep).to(self.layers[0].weight.dtype))
+        features = embed_timesteps(timestep).to(self.first.weight.dtype)
+        return F.silu(self.second(F.silu(self.first(features))))
 
 
 def make_norm(channels: int) -> nn.GroupNorm:
@@ -54,6 +57,19 @@ def make_norm(channels: int) -> nn.GroupNorm:
     return nn.GroupNorm(math.gcd(MAX_GROUPS, channels, 2 ** int(math.log2(max(1, channels / GROUP_WIDTH)))), channels)
 
 
+def make_zero(layer: Layer) -> Layer:
+    """Set the weights of a layer to zero, so that a network begins as the identity or with the output zero.
+
+    Args:
+        layer: Linear layer or convolution.
+
+    Returns:
+        The same layer.
+    """
+    nn.init.zeros_(layer.weight)
+    return layer
+
+
 class ResidualBlock3D(nn.Module):
     """Two convolutions 3 x 3 x 3 with a skip connection. The embedding scales and shifts the features between them.
 
@@ -66,10 +82,11 @@ class ResidualBlock3D(nn.Module):
     def __init__(self, inputs: int, outputs: int, embedding: int) -> None:
         super().__init__()
         self.norms = nn.ModuleList([make_norm(inputs), make_norm(outputs)])
-        self.convolutions = nn.ModuleList([nn.Conv3d(n, outputs, 3, padding=1) for n in (inputs, outputs)])
+        self.convolutions = nn.ModuleList(
+            [nn.Conv3d(inputs, outputs, 3, padding=1), make_zero(nn.Conv3d(outputs, outputs, 3, padding=1))]
+        )
         self.modulation = nn.Linear(embedding, 2 * outputs)
         self.skip = nn.Conv3d(inputs, outputs, 1) if inputs != outputs else nn.Identity()
-        nn.init.zeros_(self.convolutions[1].weight)
 
     def forward(
         self, x: Float[Tensor, "b inputs r c l"], embedding: Float[Tensor, "b e"]
@@ -99,8 +116,7 @@ class Attention3D(nn.Module):
         super().__init__()
         self.heads = max(1, channels // HEAD_WIDTH)
         self.norm, self.to_qkv = make_norm(channels), nn.Linear(channels, 3 * channels)
-        self.output = nn.Linear(channels, channels)
-        nn.init.zeros_(self.output.weight)
+        self.output = make_zero(nn.Linear(channels, channels))
 
     def forward(self, x: Float[Tensor, "b channels r c l"]) -> Float[Tensor, "b channels r c l"]:
         """Apply the layer.
@@ -169,8 +185,7 @@ class UNet3D(nn.Module):
                 now = after
             if level:
                 self.up.append(nn.Conv3d(now, now, 3, padding=1))
-        self.output = nn.Sequential(make_norm(now), nn.SiLU(), nn.Conv3d(now, outputs, 3, padding=1))
-        nn.init.zeros_(self.output[2].weight)
+        self.output = nn.Sequential(make_norm(now), nn.SiLU(), make_zero(nn.Conv3d(now, outputs, 3, padding=1)))
 
     def forward(
         self, x: Float[Tensor, "b inputs r c l"], timestep: Int[Tensor, " b"]

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from models.base import ConfiguredModel, register_computed_buffers, register_to_config
 from models.baselines.sparse import Sites, SparseConvolution, SparseDownsample, SparseUpsample
-from models.baselines.unet3d import HEAD_WIDTH, TimestepEmbedding, UNet3D
+from models.baselines.unet3d import HEAD_WIDTH, TimestepEmbedding, UNet3D, make_zero
 from models.baselines.xcube.vae import SparseResidualBlock
 from models.diffusion_model import make_noise_shares, parse_schedule
 from models.options import Integer, Number, Rule, Sequential, check_entries
@@ -218,8 +218,7 @@ class FineDiffusion(LatentDiffusion):
         self.middle = make_blocks(widths[-1], widths[-1])
         self.upsample = nn.ModuleList([SparseUpsample(b, a) for a, b in zip(widths, widths[1:], strict=False)])
         self.up = nn.ModuleList([make_blocks(2 * n, n) for n in widths[:-1]])
-        self.output = nn.Sequential(nn.LayerNorm(width), nn.SiLU(), nn.Linear(width, channels))
-        nn.init.zeros_(self.output[2].weight)
+        self.output = nn.Sequential(nn.LayerNorm(width), nn.SiLU(), make_zero(nn.Linear(width, channels)))
         register_computed_buffers(self)
 
     def find_sites(self, top: Sites) -> list[Sites]:

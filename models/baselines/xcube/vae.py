@@ -203,7 +203,7 @@ class VoxelVAE(ConfiguredModel):
         Raises:
             ValueError: A side of the input is not a multiple of `factor`.
         """
-        return coarsen_shape(tuple(shape), (self.factor,) * 3)
+        return coarsen_shape(tuple(shape), (self.factor, self.factor, self.factor))
 
     def find_sites(self, voxels: Int[Tensor, "b r c l"], coarse: Int[Tensor, "b rr cc ll"] | None) -> list[Sites]:
         """Find the active voxels of all levels.
