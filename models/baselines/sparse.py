@@ -20,6 +20,7 @@ from torch import Tensor, nn
 OFFSETS = 27  # Voxels of a 3 x 3 x 3 neighbourhood.
 CHILDREN = 8  # Voxels of the next finer grid in a voxel.
 MAX_SITES = 2**31 - 1  # The index volume holds int32 values.
+TABLE_ROWS = 2**18  # Rows of a table that are computed together.
 GATHER_VALUES = {"cpu": 2**19, "cuda": 2**26}  # Gathered values per part; 2 MB fit into the cache of a CPU core.
 
 
@@ -84,7 +85,8 @@ class Sites:
         index = F.pad(self.index, (1, 1, 1, 1, 1, 1), value=len(self))
         strides = self.coords.new_tensor(index.stride())
         steps = torch.cartesian_prod(*[torch.arange(3, device=index.device)] * 3) @ strides[1:]
-        return index.view(-1)[(self.coords @ strides)[:, None] + steps]
+        parts = (self.coords @ strides).split(TABLE_ROWS)
+        return torch.cat([index.view(-1)[part[:, None] + steps] for part in parts])
 
     def coarsen(self) -> Sites:
         """Return the voxels of twice the size that contain active voxels."""
@@ -197,7 +199,10 @@ def _count_rows(x: Tensor) -> int:
 def _convolve(x: Tensor, weight: Tensor, table: Tensor) -> Tensor:
     """Return the sum over k of x[table[:, k]] @ weight[k]."""
     padded, matrix = F.pad(x, (0, 0, 0, 1)), weight.reshape(-1, weight.shape[2])
-    return torch.cat([_take_rows(padded, part) @ matrix for part in table.split(_count_rows(x))])
+    result, rows = x.new_empty(len(table), weight.shape[2]), _count_rows(x)
+    for part, out in zip(table.split(rows), result.split(rows), strict=True):
+        torch.mm(_take_rows(padded, part), matrix, out=out)
+    return result
 
 
 class SparseConvolution(nn.Module):

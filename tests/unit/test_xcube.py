@@ -423,6 +423,36 @@ def test_all_parameters_get_finite_gradients(stage, empty):
     assert others == []
 
 
+def find_velocity(latent: Tensor, clean: Tensor, alpha_bar: Tensor) -> Tensor:
+    """Return v of noisy latents whose clean latents are known."""
+    noise = (latent - alpha_bar.sqrt() * clean) / (1 - alpha_bar).sqrt()
+    return alpha_bar.sqrt() * noise - (1 - alpha_bar).sqrt() * clean
+
+
+@pytest.mark.parametrize("is_fine", [False, True])
+def test_diffusion_losses_are_zero_for_the_true_velocity(is_fine):
+    networks, arrays = make_networks(), make_arrays(make_scenes(2, SHAPE))
+    coarse, vae = arrays["voxels_4x4x4"], networks[FINE_VAE if is_fine else COARSE_VAE]
+    assert isinstance(vae, VoxelVAE)
+    torch.nn.init.constant_(vae.moments[1].bias[3:], -30.0)  # pyright: ignore
+    torch.nn.init.zeros_(vae.moments[1].weight[3:])  # pyright: ignore
+    mean, _, sites = encode_scenes(vae, arrays["voxels"] if is_fine else coarse, coarse if is_fine else None)
+    shares = torch.from_numpy(XCUBE_SCHEDULE.alpha_bar).float()
+
+    def predict(scale: float, latent: Tensor, timestep: Tensor, *condition) -> Tensor:
+        if is_fine:
+            assert torch.equal(condition[0], coarse[coarse != EMPTY].long()) and len(condition[1]) == 2
+            return find_velocity(latent, mean / scale, shares[timestep][sites.scene][:, None])
+        clean = sites.to_dense(mean).movedim(-1, 1) / scale
+        return find_velocity(latent, clean, shares[timestep].view(-1, 1, 1, 1, 1))
+
+    loss = list_losses(networks)[FINE_DIFFUSION if is_fine else COARSE_DIFFUSION]
+    scale = networks[FINE_DIFFUSION if is_fine else COARSE_DIFFUSION].config.scale
+    assert scale != 1.0
+    assert float(loss(partial(predict, scale), arrays, make_generators(0, 1))["loss"].detach()) < 1e-5
+    assert float(loss(partial(predict, 1.0), arrays, make_generators(0, 1))["loss"].detach()) > 1e-4
+
+
 @pytest.mark.parametrize("stage", PAPER_PARAMETERS)
 def test_losses_in_bfloat16_are_near_float32(stage):
     networks, arrays = make_networks(), make_arrays(make_scenes(2, SHAPE))
@@ -497,6 +527,31 @@ def test_scenes_depend_only_on_their_generators(pipeline):
     assert both[FINE].max() < NUM_CLASSES and not torch.equal(both[FINE][0], both[FINE][1])
     outside = repeat_grids(both[COARSE], COARSE) == EMPTY
     assert outside.any() and not both[FINE][outside].any()
+
+
+def test_perfect_denoisers_generate_the_encoded_scenes(monkeypatch):
+    """With denoisers that know the clean latents, both levels are those of the VAEs."""
+    pipeline, voxels = Pipeline(make_networks()), make_scenes(2, SHAPE)
+    shares = torch.from_numpy(XCUBE_SCHEDULE.alpha_bar).float()
+    coarse = pipeline.reconstruct_levels(voxels)[COARSE]
+    mean, _, sites = encode_scenes(pipeline.coarse_vae, coarsen_grids(voxels, COARSE), None)
+    dense = sites.to_dense(mean).movedim(-1, 1) / pipeline.coarse_diffusion.config.scale
+    fine_latent = torch.randn(int((coarse != EMPTY).sum()), 3, generator=make_generators(3)[0])
+
+    def predict_coarse(latent: Tensor, timestep: Tensor) -> Tensor:
+        return find_velocity(latent, dense, shares[timestep].view(-1, 1, 1, 1, 1))
+
+    def predict_fine(latent: Tensor, timestep: Tensor, classes: Tensor, sites: list[Sites]) -> Tensor:
+        assert torch.equal(classes, coarse[coarse != EMPTY].long())
+        clean = fine_latent / pipeline.fine_diffusion.config.scale
+        return find_velocity(latent, clean, shares[timestep][sites[0].scene][:, None])
+
+    monkeypatch.setattr(pipeline.coarse_diffusion, "forward", predict_coarse)
+    monkeypatch.setattr(pipeline.fine_diffusion, "forward", predict_fine)
+    grids = pipeline.sample(make_generators(0, 1))
+    assert torch.equal(grids[COARSE], coarse)
+    expected = pipeline.fine_vae.decode(fine_latent, Sites.from_mask(coarse != EMPTY), coarse.long()).to_voxels()
+    assert expected.any() and torch.equal(grids[FINE], expected)
 
 
 def test_inpaint_keeps_known_columns(pipeline):
