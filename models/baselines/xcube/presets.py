@@ -135,7 +135,7 @@ PRESETS: dict[str, tuple[Stage, ...]] = {
             coarse_diffusion={"width": 32},
             fine_diffusion={"width": 32, "blocks": 1},
             crop=16,
-            steps=(2_000, 2_400, 2_500, 4_500),
+            steps=(2_400, 3_200, 3_000, 4_800),
             batch_sizes=(4, 2, 16, 4),
             learning_rates=(1e-3, 2e-4),
         )
