@@ -13,6 +13,7 @@ from models.baselines.base import coarsen_grids, repeat_grids
 from models.baselines.sparse import Sites
 from models.baselines.unet3d import UNet3D
 from models.baselines.xcube import PRESETS, Pipeline
+from models.baselines.xcube import pipeline as xcube_pipeline
 from models.baselines.xcube.diffusion import XCUBE_SCHEDULE, CoarseDiffusion, FineDiffusion, sample_latents
 from models.baselines.xcube.losses import (
     COARSE,
@@ -565,6 +566,38 @@ def test_inpaint_keeps_known_columns(pipeline):
     for k in range(2):
         alone = pipeline.inpaint(voxels[k : k + 1], unknown[k : k + 1], make_generators(1 + k))
         assert torch.equal(alone[0], result[k])
+
+
+def test_inpaint_conditions_both_levels_on_known_latents(monkeypatch):
+    networks, voxels = make_networks(), make_scenes(1, SHAPE)
+    unknown = torch.zeros(1, *SHAPE[:2], dtype=torch.bool)
+    unknown[:, 13:, :8] = True  # The first coarse row of the unknown part has one known fine row.
+    known = torch.where(unknown[..., None], EMPTY, voxels)
+    coarse_known, conditions, levels = coarsen_grids(known, COARSE), [], []
+    for layer in networks[COARSE_VAE].structure:  # pyright: ignore
+        torch.nn.init.constant_(layer.bias, -100.0)
+    pipeline = Pipeline(networks)
+    sample_fine = pipeline._sample_fine
+
+    def spy(*args):
+        conditions.append(args[3:])
+        return sample_latents(*args)
+
+    def spy_fine(coarse: Tensor, *args) -> Tensor:
+        levels.append(coarse)
+        return sample_fine(coarse, *args)
+
+    monkeypatch.setattr(xcube_pipeline, "sample_latents", spy)
+    monkeypatch.setattr(pipeline, "_sample_fine", spy_fine)
+    pipeline.inpaint(voxels, unknown, make_generators(0))
+    assert torch.equal(levels[0], coarse_known)  # The generated coarse part is empty, but known content is kept.
+    (latent, mask), (fine_latent, fine_mask) = conditions
+    mean, _, sites = encode_scenes(pipeline.coarse_vae, coarse_known, None)
+    torch.testing.assert_close(latent, sites.to_dense(mean) / 1.5)
+    assert mask[0, ..., 0, 0].nonzero().tolist() == [[1, 0], [2, 0], [3, 0]]
+    mean, _, sites = encode_scenes(pipeline.fine_vae, known, coarse_known)
+    torch.testing.assert_close(fine_latent, mean / 0.7)
+    assert torch.equal(fine_mask[:, 0], (sites.coords[:, 1] >= 3) & (sites.coords[:, 2] < 2))
 
 
 def test_inpaint_reads_known_columns(pipeline):
