@@ -111,14 +111,14 @@ class VoxelPipeline(ABC):
             (n, rows, cols, levels) uint8: the scenes. Known columns are those of `voxels`.
         """
 
-    def reconstruct(self, voxels: Tensor) -> Tensor:
+    def reconstruct(self, voxels: Tensor) -> Grids:
         """Encode and decode scenes.
 
         Args:
             voxels: (n, rows, cols, levels) uint8: finest grids of the scenes.
 
         Returns:
-            (n, rows, cols, levels) uint8.
+            Grids of all levels, from coarse to fine. Each level is given the true coarser level.
 
         Raises:
             ValueError: The method has no autoencoder.

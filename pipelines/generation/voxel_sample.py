@@ -171,7 +171,7 @@ class VoxelSampler:
         voxels = torch.from_numpy(np.stack(given))
         finest = pipeline.factors[-1]
         if request.task == "reconstruct":
-            return {finest: pipeline.reconstruct(voxels)}
+            return pipeline.reconstruct(voxels)
         if request.task == "outpaint":
             return {finest: pipeline.outpaint(voxels, *request.windows, generators)}
         unknown = mark_half(voxels.shape[1:3], request.half).expand(len(voxels), -1, -1)
@@ -274,7 +274,7 @@ def sample_voxels(
     guard_run(request.output, request.source(), request.run, options)
     if request.dataset:
         list_given_scenes(request)
-    levels = [FINE, *pipeline.factors[:-1]] if request.task == "sample" else [FINE]
+    levels = [FINE, *pipeline.factors[:-1]] if request.task in ("sample", "reconstruct") else [FINE]
     promised = {
         shard.path("voxels"): len(request.indices(shard.number)) for level in levels for shard in request.shards(level)
     }

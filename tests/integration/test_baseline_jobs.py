@@ -143,8 +143,8 @@ def test_sample_baseline_writes_voxels_and_pictures(task, voxels, model, tmp_pat
 
     given = {} if task == "sample" else {"input": voxels}
     config = Config(model, task, output=str(tmp_path), num_scenes=3, batch_size=2, half="left", **given)
-    request, summary = sample(config)
-    (shards,) = (find_shards(str(tmp_path), "voxels", source=f"generated-semcity-{task}"),)
+    _, summary = sample(config)
+    shards = find_shards(str(tmp_path), "voxels", source=f"generated-semcity-{task}")
     made = dict(iterate_voxels(shards))
     side = 512 if task == "outpaint" else 256
     assert len(made) == 3 and {grid.shape for grid in made.values()} == {(side, side, 32)}

@@ -534,7 +534,7 @@ def test_perfect_denoisers_generate_the_encoded_scenes(monkeypatch):
     """With denoisers that know the clean latents, both levels are those of the VAEs."""
     pipeline, voxels = Pipeline(make_networks()), make_scenes(2, SHAPE)
     shares = torch.from_numpy(XCUBE_SCHEDULE.alpha_bar).float()
-    coarse = pipeline.reconstruct_levels(voxels)[COARSE]
+    coarse = pipeline.reconstruct(voxels)[COARSE]
     mean, _, sites = encode_scenes(pipeline.coarse_vae, coarsen_grids(voxels, COARSE), None)
     dense = sites.to_dense(mean).movedim(-1, 1) / pipeline.coarse_diffusion.config.scale
     fine_latent = torch.randn(int((coarse != EMPTY).sum()), 3, generator=make_generators(3)[0])
@@ -630,18 +630,18 @@ def test_outpaint_continues_scenes(pipeline):
 
 def test_reconstruct_gives_both_levels(pipeline):
     voxels = make_scenes(2, SHAPE)
-    levels = pipeline.reconstruct_levels(voxels)
-    assert torch.equal(levels[FINE], pipeline.reconstruct(voxels)) and levels[FINE].shape == voxels.shape
+    levels = pipeline.reconstruct(voxels)
+    assert levels[FINE].shape == voxels.shape
     assert levels[COARSE].shape == (2, 8, 8, 2)
     coarse = coarsen_grids(voxels, COARSE)
     assert torch.equal(levels[FINE], reconstruct(pipeline.fine_vae, voxels, coarse))
     assert torch.equal(levels[COARSE], reconstruct(pipeline.coarse_vae, coarse, None))
-    assert torch.equal(pipeline.reconstruct(voxels[1:])[0], levels[FINE][1])
+    assert torch.equal(pipeline.reconstruct(voxels[1:])[FINE][0], levels[FINE][1])
 
 
 def test_empty_scenes_are_valid(pipeline):
     empty = torch.zeros(1, *SHAPE, dtype=torch.uint8)
-    assert not pipeline.reconstruct(empty).any()
+    assert not any(grid.any() for grid in pipeline.reconstruct(empty).values())
     unknown = torch.zeros(1, *SHAPE[:2], dtype=torch.bool)
     unknown[:, :16] = True
     assert not pipeline.inpaint(empty, unknown, make_generators(1))[:, 16:].any()

@@ -76,16 +76,16 @@ class Pipeline(VoxelPipeline):
         return {self.factors[0]: self.autoencoder.decode_voxels(self._sample_triplanes(generators))}
 
     @torch.no_grad()
-    def reconstruct(self, voxels: Tensor) -> Tensor:
+    def reconstruct(self, voxels: Tensor) -> Grids:
         """Encode scenes to triplanes, and decode the most probable class of each voxel.
 
         Args:
             voxels: (n, rows, cols, levels) uint8 grids.
 
         Returns:
-            (n, rows, cols, levels) uint8.
+            Grids of the only level.
         """
-        return self.autoencoder.decode_voxels(self.autoencoder.encode(voxels.to(self.device)))
+        return {self.factors[0]: self.autoencoder.decode_voxels(self.autoencoder.encode(voxels.to(self.device)))}
 
     @torch.no_grad()
     def inpaint(self, voxels: Tensor, unknown: Tensor, generators: Sequence[torch.Generator]) -> Tensor:

@@ -82,19 +82,7 @@ class Pipeline(VoxelPipeline):
         return {COARSE: coarse, FINE: self._sample_fine(coarse, list(generators))}
 
     @torch.no_grad()
-    def reconstruct(self, voxels: Tensor) -> Tensor:
-        """Encode and decode scenes with the fine VAE, given the true coarse level, as in the paper's table.
-
-        Args:
-            voxels: (n, rows, cols, levels) uint8: finest grids of the scenes.
-
-        Returns:
-            (n, rows, cols, levels) uint8.
-        """
-        return self.reconstruct_levels(voxels)[FINE]
-
-    @torch.no_grad()
-    def reconstruct_levels(self, voxels: Tensor) -> Grids:
+    def reconstruct(self, voxels: Tensor) -> Grids:
         """Encode and decode each level of scenes with its VAE. The fine level is given the true coarse level.
 
         Args:
