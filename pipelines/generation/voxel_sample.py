@@ -271,7 +271,7 @@ def sample_voxels(
     pipeline = load_baseline(request.model)
     options = {name: value for name, value in asdict(request).items() if name not in ("model", "output")}
     options["weights"] = "-".join(digest_weights(network) for network in pipeline.networks.values())
-    guard_run(request.output, request.source(), request.run, options)
+    guard_run(request.output, request.source(), request.run, options, [request.shards()[0].place("voxels")])
     if request.dataset:
         list_given_scenes(request)
     levels = [FINE, *pipeline.factors[:-1]] if request.task in ("sample", "reconstruct") else [FINE]
