@@ -45,6 +45,19 @@ def test_ddpm_step_equals_diffusers(steps):
     assert schedule.timesteps[-1] == (996 if steps == 250 else schedule.timesteps[-1])
 
 
+def test_ddpm_step_with_large_variance_equals_diffusers():
+    small = SchedulerConfig.ddpm().build()
+    reference = type(small).from_config(small.config, variance_type="fixed_large")
+    schedule = SamplingSchedule(Diffusion(), 250, large_variance=True)
+    reference.set_timesteps(250)
+    latent, predicted = torch.randn(2, *LATENT_SHAPE), torch.randn(2, *LATENT_SHAPE)
+    for state, _ in schedule.descending_transitions()[::25] + [(0, -1)]:
+        t = int(schedule.timesteps[state])
+        noise = torch.randn(2, *LATENT_SHAPE, generator=torch.Generator().manual_seed(state))
+        want = reference.step(predicted, t, latent, generator=torch.Generator().manual_seed(state)).prev_sample
+        assert torch.allclose(schedule.step_down(latent, predicted, noise, state), want, atol=2e-5), state
+
+
 @pytest.mark.parametrize("eta", [0.0, 0.3, 1.0])
 def test_ddim_step_equals_diffusers(eta):
     reference, schedule = (
@@ -345,6 +358,53 @@ def test_learning_rate_is_one_cycle_without_warm_up():
         assert np.isclose(rate, reference.get_last_lr()[0], rtol=1e-5)
         optimiser.step()
         reference.step()
+
+
+@pytest.mark.parametrize(
+    ("options", "make_reference"),
+    [
+        (
+            {"final_learning_rate": 0.0, "decay": "linear"},
+            lambda optimiser: torch.optim.lr_scheduler.PolynomialLR(optimiser, total_iters=99, power=1.0),
+        ),
+        (
+            {"milestones": ((30, 0.5), (40, 0.5))},
+            lambda optimiser: torch.optim.lr_scheduler.MultiStepLR(optimiser, [30, 40], gamma=0.5),
+        ),
+    ],
+)
+def test_learning_rate_equals_that_of_torch(options, make_reference):
+    settings = OptimizerConfig(100, 1e-3, 0.0, **options)
+    optimiser = torch.optim.AdamW([torch.zeros(1, requires_grad=True)], 1e-3)
+    reference = make_reference(optimiser)
+    for step in range(100):
+        assert np.isclose(settings.at(step)[0], reference.get_last_lr()[0], rtol=1e-5, atol=1e-12), step
+        optimiser.step()
+        reference.step()
+
+
+def test_records_lack_defaults_of_later_options():
+    """Records of earlier versions therefore equal those of this version."""
+    later = {"decay", "milestones", "amsgrad"}
+    assert not later & OptimizerConfig(10, 1e-3, 0.0).to_record().keys()
+    assert (
+        later <= OptimizerConfig(10, 1e-3, 0.0, decay="linear", milestones=((1, 0.5),), amsgrad=True).to_record().keys()
+    )
+
+
+def test_trainer_with_amsgrad_resumes_exactly(tmp_path):
+    options, batch = {"amsgrad": True, "milestones": ((2, 0.5),)}, make_dit_batch()
+    straight = make_trainer(**options)
+    curve = [float(straight.step(batch, range(8))["loss"]) for _ in range(6)]
+    first = make_trainer(**options)
+    for _ in range(3):
+        first.step(batch, range(8))
+    first.save(tmp_path)
+    second = make_trainer(**options)
+    second.load(tmp_path)
+    assert [float(second.step(batch, range(8))["loss"]) for _ in range(3)] == curve[3:]
+    with pytest.raises(ValueError, match="trained with amsgrad=True, asked for None"):
+        make_trainer(milestones=((2, 0.5),)).load(tmp_path)
 
 
 def test_pseudoinverse_guidance_halves_error():
