@@ -48,16 +48,17 @@ RULES: dict[str, Rule] = {
 }
 
 
-def embed_timesteps(timestep: Real[Tensor, " batch"]) -> Float[Tensor, "batch 256"]:
+def embed_timesteps(timestep: Real[Tensor, " batch"], width: int = FREQUENCIES) -> Float[Tensor, "batch {width}"]:
     """Compute the sinusoidal embedding of timesteps: cosines, then sines.
 
     Args:
         timestep: Timesteps.
+        width: Number of features, even.
 
     Returns:
         Embeddings.
     """
-    half = FREQUENCIES // 2
+    half = width // 2
     frequency = torch.exp(-math.log(10_000) * torch.arange(half, device=timestep.device, dtype=torch.float32) / half)
     angle = timestep.float()[:, None] * frequency
     return torch.cat([angle.cos(), angle.sin()], dim=-1)

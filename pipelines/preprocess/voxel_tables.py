@@ -11,7 +11,7 @@ from pipelines.geometry.voxels import VoxelGrid, voxelize
 from pipelines.io.voxel_table import make_voxel_row, make_voxel_table
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_tasks
-from pipelines.schema.run_guard import guard_options
+from pipelines.schema.run_guard import guard_tables
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 
@@ -90,7 +90,8 @@ def voxelize_dataset(
     Raises:
         ValueError: The output contains voxels with other options, or a scene cannot be converted.
     """
-    guard_voxels(request, selection)
+    options = {key: value for key, value in asdict(request).items() if key != "output"}
+    guard_tables(request.output, "voxels", ["voxels"], options, selection)
     shards = [(replace(shard, root=request.output), shard, rows) for shard, rows in selection.shards()]
     promised = {target.path("voxels"): len(rows) for target, _, rows in shards}
     faults = storage.find_faulty_files(promised)
@@ -111,31 +112,3 @@ def voxelize_dataset(
         if on_scenes:
             on_scenes(len(found.rows))
     return [target for target, _, _ in shards]
-
-
-def guard_voxels(request: VoxelRequest, selection: SceneSubset) -> None:
-    """Bind the voxels of each source and split in the output to one set of options.
-
-    The file voxels-<source>-<split>.json of the output records the options and the scenes.
-
-    Args:
-        request: Options.
-        selection: Scenes.
-
-    Raises:
-        ValueError: The output contains voxels of these scenes with other options, or of other scenes.
-    """
-    options = asdict(request)
-    del options["output"]
-    groups: dict[tuple[str, str], list] = {}
-    for (shard, _), found in zip(selection.shards(), selection.files(), strict=True):
-        groups.setdefault((shard.source, shard.split), []).append(found)
-    for (source, split), files in groups.items():
-        place = Shard(request.output, source, split, 0).place("voxels")
-        guard_options(
-            storage.join_uri(request.output, f"voxels-{source}-{split}.json"),
-            options | {"scenes": files},
-            is_in_use=lambda place=place: bool(storage.list_files(place, "")),
-            discard=lambda: None,
-            describe=lambda difference: f"{request.output} holds voxels with {difference}; choose another --output",
-        )

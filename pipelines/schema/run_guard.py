@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 from pipelines.runtime import storage
 from pipelines.schema.columns import TABLES
+from pipelines.schema.scene_subset import SceneSubset
+from pipelines.schema.tables import Shard
 
 
 def guard_options(
@@ -36,6 +38,37 @@ def guard_options(
             raise ValueError(describe(difference))
         discard()
     storage.write_json(options, record)
+
+
+def guard_tables(
+    output: str, name: str, tables: Sequence[str], options: Mapping[str, object], selection: SceneSubset
+) -> None:
+    """Bind tables that follow from scenes to one set of options, for each source and split.
+
+    The file `<name>-<source>-<split>.json` of the output records the options and the scenes.
+
+    Args:
+        output: Dataset directory of the tables.
+        name: What the tables hold, for file names and messages.
+        tables: Names of the tables.
+        options: Options of this run; values must be valid in JSON.
+        selection: Scenes.
+
+    Raises:
+        ValueError: The output contains tables of these scenes with other options, or of other scenes.
+    """
+    groups: dict[tuple[str, str], list] = {}
+    for (shard, _), found in zip(selection.shards(), selection.files(), strict=True):
+        groups.setdefault((shard.source, shard.split), []).append(found)
+    for (source, split), files in groups.items():
+        places = [Shard(output, source, split, 0).place(table) for table in tables]
+        guard_options(
+            storage.join_uri(output, f"{name}-{source}-{split}.json"),
+            {**options, "scenes": files},
+            is_in_use=lambda places=places: any(storage.list_files(place, "") for place in places),
+            discard=lambda: None,
+            describe=lambda difference: f"{output} holds {name} with {difference}; choose another --output",
+        )
 
 
 def guard_run(output: str, source: str, run: str, options: Mapping[str, object], parts: Sequence[str] = ()) -> None:

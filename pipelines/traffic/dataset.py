@@ -15,7 +15,7 @@ from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_tasks
 from pipelines.schema.columns import TRACKS, TRAFFIC, TRAFFIC_TABLES
 from pipelines.schema.ground_surface import find_surface
-from pipelines.schema.run_guard import guard_options
+from pipelines.schema.run_guard import guard_tables
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 from pipelines.traffic.demand import KINDS, Demand
@@ -192,7 +192,8 @@ def simulate_dataset(
         ValueError: The output contains tracks with other options.
     """
     check_sumo(require_sumo())
-    guard_traffic(request, selection)
+    options = {key: value for key, value in asdict(request).items() if key != "output"}
+    guard_tables(request.output, "traffic", TRAFFIC_TABLES, options, selection)
     shards = [(replace(shard, root=request.output), shard, rows) for shard, rows in selection.shards()]
     waiting = {target: (source, rows) for target, source, rows in shards if not is_written(target, rows, request)}
     if on_scenes:
@@ -213,34 +214,6 @@ def simulate_dataset(
         if on_scenes:
             on_scenes(len(found.traffic))
     return [target for target, _, _ in shards]
-
-
-def guard_traffic(request: TrafficRequest, selection: SceneSubset) -> None:
-    """Bind the traffic of each source and split in the output to one set of options.
-
-    The file traffic-<source>-<split>.json of the output records the options and the scenes.
-
-    Args:
-        request: Options.
-        selection: Scenes.
-
-    Raises:
-        ValueError: The output contains traffic of these scenes with other options, or of other scenes.
-    """
-    options = asdict(request)
-    del options["output"]
-    groups: dict[tuple[str, str], list] = {}
-    for (shard, _), found in zip(selection.shards(), selection.files(), strict=True):
-        groups.setdefault((shard.source, shard.split), []).append(found)
-    for (source, split), files in groups.items():
-        places = [Shard(request.output, source, split, 0).place(table) for table in TRAFFIC_TABLES]
-        guard_options(
-            storage.join_uri(request.output, f"traffic-{source}-{split}.json"),
-            options | {"scenes": files},
-            is_in_use=lambda places=places: any(storage.list_files(place, "") for place in places),
-            discard=lambda: None,
-            describe=lambda difference: f"{request.output} holds traffic with {difference}; choose another --output",
-        )
 
 
 def is_written(shard: Shard, rows: Sequence[int], request: TrafficRequest) -> bool:

@@ -16,13 +16,13 @@ from torch import Tensor, nn
 
 from models.base import ConfiguredModel, apply_in_float32, register_to_config
 from models.baselines.discrete_diffusion import MultinomialDiffusion
+from models.dit import embed_timesteps
 from models.limits import require_within
 from models.options import Flag, Integer, Rule, Sequential, check_entries
 from models.voxel_grids import NUM_CLASSES
 
 GROUPS = 32  # Largest number of groups of the group normalisation.
 ATTENTION_SCALE = 10.0  # Factor of the cosines between queries and keys.
-MAX_PERIOD = 10_000.0  # Longest period of the timestep embedding.
 NUM_HALVED_LEVELS = 2  # Number of first downsamplings that also halve the number of levels.
 ACROSS_COLS, ACROSS_ROWS, CUBE = (1, 3, 3), (3, 1, 3), (3, 3, 3)  # Kernels.
 RULES: dict[str, Rule] = {
@@ -35,14 +35,6 @@ RULES: dict[str, Rule] = {
     "num_classes": Integer(2, 256),
     "num_timesteps": Integer(1, 10_000),
 }
-
-
-def _embed_timesteps(timestep: Tensor, width: int) -> Tensor:
-    """Return cosines and sines (b, width) of timesteps (b,)."""
-    half = width // 2
-    exponent = torch.arange(half, dtype=torch.float32, device=timestep.device) / half
-    angle = timestep[:, None] * torch.exp(-math.log(MAX_PERIOD) * exponent)
-    return torch.cat([angle.cos(), angle.sin()], dim=1)
 
 
 def _make_norm(channels: int) -> nn.GroupNorm:
@@ -229,7 +221,7 @@ class PyramidDenoiser(ConfiguredModel):
         """
         embedded = self.embedding(noisy).movedim(-1, 1)
         x = self.enter(torch.cat([embedded, condition.to(embedded.dtype)], dim=1))
-        time = self.time(_embed_timesteps(timestep, self.embedding.embedding_dim).to(embedded.dtype))
+        time = self.time(embed_timesteps(timestep, self.embedding.embedding_dim).to(embedded.dtype))
         x = self.first(x, time)
         skips = []
         for down, pool in zip(self.down, self.pool, strict=True):

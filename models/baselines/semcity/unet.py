@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from models.base import ConfiguredModel, register_to_config
 from models.baselines.semcity.triplane import Planes, PlaneSizes, join_planes, split_planes
+from models.dit import embed_timesteps
 from models.options import Integer, Number, Rule, Sequential, check_entries
 from models.sampling.diffusion import Diffusion
 
@@ -123,21 +124,6 @@ class TriplaneUNet(ConfiguredModel):
             for layer in stage:  # pyright: ignore[reportGeneralTypeIssues]
                 planes = layer(planes, emb)
         return join_planes(self.last(map_planes(F.silu, self.last_norm(planes))))
-
-
-def embed_timesteps(timestep: Int[Tensor, " b"], width: int) -> Float[Tensor, "b width"]:
-    """Return cosines and sines of timesteps at geometric frequencies from 1 to 1 / 10,000.
-
-    Args:
-        timestep: Timesteps.
-        width: Number of features, even.
-
-    Returns:
-        Features.
-    """
-    frequency = torch.exp(-math.log(10_000) / (width // 2) * torch.arange(width // 2, device=timestep.device))
-    angle = timestep[:, None].float() * frequency
-    return torch.cat([angle.cos(), angle.sin()], dim=1)
 
 
 def map_planes(function: Callable[[Tensor], Tensor], planes: Planes) -> Planes:
